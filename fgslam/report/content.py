@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
@@ -24,7 +25,6 @@ from fgslam.core.types import Remark
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 
 if TYPE_CHECKING:
-    import pandas as pd
     from plotly import graph_objects as go
 
 
@@ -300,8 +300,8 @@ def read_table(
     known: Iterable[str] = (),
     whole: Iterable[str] = (),
     again: str = "run the experiment again",
-) -> pd.DataFrame:
-    """A table that a run wrote: numbers as floats, NaN where they are not known, and texts.
+) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a table that a run wrote: numbers as floats, NaN where not known, and texts.
 
     Args:
         path: the .csv file.
@@ -314,25 +314,24 @@ def read_table(
     Raises:
         DatasetError: the file cannot be read, lacks a column, or has a cell that is no number.
     """
-    import pandas as pd
-
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            table = pd.DataFrame(list(reader), columns=list(reader.fieldnames or []))
-    except (OSError, UnicodeDecodeError) as error:
+            header, *rows = [row for row in csv.reader(file) if row] or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DatasetError(f"{path}: cannot be read ({error}); {again}") from error
-    numbers = list(table.columns if numbers is None else numbers)
+    numbers = list(header if numbers is None else numbers)
+    table: dict[str, npt.NDArray[Any]] = {}
     for column in (*numbers, *texts):
-        if column not in table:
+        if column not in header:
             raise DatasetError(f"{path}: lacks column {column}; {again}")
-        cells = table[column]
-        if cells.isna().any():
-            line = int(cells.isna().argmax()) + 2
-            raise DatasetError(f"{path}, line {line}: ends before column {column}; {again}")
+        at = header.index(column)
+        short = next((k for k, row in enumerate(rows) if len(row) <= at), None)
+        if short is not None:
+            raise DatasetError(f"{path}, line {short + 2}: ends before column {column}; {again}")
+        cells = np.array([row[at] for row in rows], np.object_)
+        table[column] = cells
         if column not in numbers:
             continue
-        # Not by pandas, whose numbers may differ in their last bit.
         values = np.array([_parsed(cell) for cell in cells], np.float64)
         wrong = np.isinf(values) | (np.isnan(values) & ((cells != "") | (column in known)))
         if column in whole:

@@ -289,7 +289,7 @@ class OutputSettings:
     pictures: bool = Field(default=True, description="draw the pictures of the run folder")
     report: bool = Field(default=True, description="write report.html")
     checkpoint_seconds: NonNegative = Field(
-        default=2.0, description="interval of checkpoints for --resume; 0: each frame"
+        default=30.0, description="interval of checkpoints for --resume; 0: each frame"
     )
 
 

@@ -263,7 +263,8 @@ def read_closures(path: Path) -> tuple[TextTable, tuple[tuple[int, int], ...]]:
         path, (*whole, *lengths, "error_deg"), ("taken", "false"), known=whole, whole=whole
     )
     rows, closed = [], []
-    for row in table.to_dict("records"):
+    for cells in zip(*table.values(), strict=True):
+        row = dict(zip(table, cells, strict=True))
         if taken := row["taken"] == "true":
             closed.append((int(row["at"]), int(row["to"])))
         values = (
@@ -438,7 +439,7 @@ def _section(values: dict[str, Any], name: str) -> dict[str, Any]:
 def _columns(path: Path) -> dict[str, FloatArray] | None:
     """The columns of a table of numbers; None where it has no row."""
     table = read_table(path)
-    return None if table.empty else {str(name): table[name].to_numpy() for name in table}
+    return table if all(map(len, table.values())) else None
 
 
 def _up(log: Path | None) -> FloatArray:
@@ -488,9 +489,9 @@ def _estimator(folder: Path, values: dict[str, Any], truth: Trajectory | None) -
     update_ms, counts = report.update_ms, {}
     if (path := folder / FRAMES_FILE).is_file():
         table = read_table(path, ("timestamp", "update_ms", *COUNTS))
-        stamps = table["timestamp"].to_numpy()
-        update_ms = _at(final, stamps, table["update_ms"].to_numpy())
-        counts = {name: _at(final, stamps, table[name].to_numpy(np.float64)) for name in COUNTS}
+        stamps = table["timestamp"]
+        update_ms = _at(final, stamps, table["update_ms"])
+        counts = {name: _at(final, stamps, table[name]) for name in COUNTS}
     return replace(
         report,
         update_ms=update_ms,

@@ -227,9 +227,10 @@ def follow_rows(table: Path) -> list[Row]:
     found = read_table(
         table, (*_WHOLE, *_NUMBERS), _TEXTS, known=("image", "time_s"), whole=_WHOLE, again=again
     )
-    if found.empty:
+    rows = [dict(zip(found, values, strict=True)) for values in zip(*found.values(), strict=True)]
+    if not rows:
         raise DatasetError(f"{table}: holds no image that was followed; {again}")
-    return found.to_dict("records")  # type: ignore[return-value]
+    return rows
 
 
 def _taught_recording(taught: Path, path: PathMemory) -> OmniRecording:

@@ -8,7 +8,6 @@ enters a map: :mod:`fgslam.runs.tasks.slam_map_entry`. Files and numbers:
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -167,8 +166,7 @@ def _loop(
     shown = frames_to_show(len(sequence)) if output.pictures else frozenset()
     stream = make_stream(sequence, frontend, frontend.tracking == "sift")(start=len(recorder))
     waiting = time.perf_counter()
-    interval = output.checkpoint_seconds
-    saved = -math.inf  # the first frame is saved at once: from then on any end can be resumed
+    interval, saved = output.checkpoint_seconds, waiting
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
