@@ -70,10 +70,21 @@ class Rectifier(Brief):
         """Rectified (right, left[, top]) of raw images given in that order."""
         return tuple(self.rectify(k, raw[self.order[k]]) for k in range(self.rig.cameras))
 
+    def raw_pixels(self, camera: int, pixels: FloatArray) -> FloatArray:
+        """Where rectified pixels (n, 2) of a camera lie in its raw image (n, 2), bilinear."""
+        columns, rows = (column.astype(np.float32)[:, None] for column in pixels.T)
+        found = [cv2.remap(m, columns, rows, cv2.INTER_LINEAR)[:, 0] for m in self.maps[camera]]
+        return np.column_stack(found).astype(np.float64)
+
     @cached_property
     def raw_size(self) -> tuple[int, int]:
         """Width and height of the images that it takes."""
         return self.size or (self.rig.width, self.rig.height)
+
+    @cached_property
+    def overlap(self) -> float:
+        """Share of the rectified image that all cameras show something of, at infinity."""
+        return float(np.logical_and.reduce(self.masks).mean())
 
     @cached_property
     def masks(self) -> tuple[npt.NDArray[np.bool_], ...]:
@@ -170,12 +181,12 @@ def chosen_view(
         for camera, rotation in zip(cameras, rotations, strict=True):
             inner = _inner(camera, rotation)
             low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
-    width, height = size
     if fov_deg is None:
         natural = _LEAST_RESOLUTION * float(np.mean([camera.focal_px for camera in cameras]))
-        focal = max(width / (high[0] - low[0]), height / (high[1] - low[1]), natural)
+        # Where no rectangle is seen by all, borders are black.
+        focal = max(*(np.array(size) / (high - low)), natural) if (high > low).all() else natural
     else:
-        focal = width / (high[0] - low[0])
+        focal = size[0] / (high[0] - low[0])
     middle = 0.5 * (low + high)
     column, row = (0.5 * (np.array(size) - 1.0) - focal * middle).tolist()
     return View(np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]]), size)
@@ -187,19 +198,20 @@ def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatAr
     along, start = np.linspace(0.0, 1.0, _BORDER_STEPS), np.zeros(_BORDER_STEPS)
     down, across = along * height, along * width
     sides = ((start, down), (start + width, down), (across, start), (across, start + height))
-    middle = _on_plane(camera, rotation, camera.matrix[:2, 2][None])
     low, high = np.full(2, -np.inf), np.full(2, np.inf)
-    for columns, rows in sides:
-        found = _on_plane(camera, rotation, np.column_stack([columns, rows]))
-        if not len(found) or not len(middle):
+    # Which axis of the view the raw columns run along, and which way: it may be turned by 90
+    # degrees. Places of borders do not tell: a principal point may lie at one.
+    of_columns = int(np.argmax(np.abs(rotation[:2, 0])))
+    for number, (columns, rows) in enumerate(sides):
+        raw_axis, far = divmod(number, 2)
+        axis = of_columns if raw_axis == 0 else 1 - of_columns
+        found = _on_plane(camera, rotation, np.column_stack([columns, rows]))[:, axis]
+        if not len(found):
             continue
-        # Which side of the view it is: a view may be turned by 90 degrees.
-        away = found.mean(axis=0) - middle[0]
-        axis = int(np.argmax(np.abs(away)))
-        if away[axis] < 0.0:
-            low[axis] = max(low[axis], found[:, axis].max())
+        if (rotation[axis, raw_axis] > 0.0) == bool(far):
+            high[axis] = min(high[axis], found.min())
         else:
-            high[axis] = min(high[axis], found[:, axis].min())
+            low[axis] = max(low[axis], found.max())
     return low, high
 
 

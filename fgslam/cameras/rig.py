@@ -98,6 +98,11 @@ class StereoRig(CameraRig):
         return (self.width, self.height) if self.rectifier is None else self.rectifier.raw_size
 
     @property
+    def overlap(self) -> float:
+        """Share of the rectified image that all cameras show something of, at infinity; 0 to 1."""
+        return 1.0 if self.rectifier is None else self.rectifier.overlap
+
+    @property
     def margins(self) -> tuple[npt.NDArray[np.float32], ...]:
         """Per camera, how far each rectified pixel is from what shows nothing; empty: all do."""
         return () if self.rectifier is None else self.rectifier.margins
@@ -521,6 +526,7 @@ _LEAST_COMMON_VIEW = 0.707
 # A stated view with less of the raw resolution than this has collapsed.
 _LEAST_STATED = 0.5
 _SAME_PX = 1e-3  # cameras that differ by less are rectified already
+_LEAST_OVERLAP = 0.5  # of the rectified view; less is reported
 _KEPT_SHARE = 0.8  # of the angle of view; less is reported as cut off
 _SKEW_DEG = 0.5  # from a right angle between the baselines of three cameras: reported beyond
 _GIVEN_AS = (1, 0, 2)
@@ -547,6 +553,12 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     values = calibration.corrections
     corrected = None if values is None else lambda rig: correction_values(source, values, rig)
     found = rectifier(chosen, rotations, view, corrected)
+    if not found.overlap:
+        raise CalibrationError(
+            f"{source}: no place of the rectified view is seen by all of "
+            f"{', '.join(camera.name for camera in chosen)}; check how they are turned to each "
+            "other (R, T_BS) and their principal points, or choose a view: dataset.fov_deg, --fov"
+        )
     turns = [np.eye(3)] * len(cameras)
     for k, rotation in zip(sources, rotations, strict=True):
         turns[k] = rotation
@@ -557,6 +569,8 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
         text = f"{source} does not state the model of its four coefficients: taken as {model}"
         other = "equidistant" if model == "radtan" else "radtan"
         remarks = (*remarks, f"{text}; if they are {other}, say --set dataset.lens={other}")
+    if found.overlap < _LEAST_OVERLAP:
+        remarks = (*remarks, f"{source}: cameras share {found.overlap:.0%} of the rectified view")
     if calibration.sided and len(sources) == 2:
         found = replace(found, order=tuple(_GIVEN_AS[k] for k in sources))
         if sources == (0, 1) and not notes:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.log import MeasurementRecording
@@ -65,8 +66,8 @@ def open_recording(
     known = None if found.rectifier is None else found.rectifier.calibration
     if known is not None and known.guessed_lens:
         found = _by_lens(found, known.guessed_lens, lambda s: read(s, odometry), settings)
-    if found.unrectified:
-        misfit = fit_notes(lambda i: found.frame(i).images, len(found))
+    if found.rectifier is not None and found.unrectified:
+        misfit = fit_notes(lambda i: found.frame(i).images, len(found), found.rectifier)
         found = replace(found, notes=(*misfit, *found.notes))
     return found if settings.scale == 1.0 else smaller(found, settings.scale)
 
@@ -80,11 +81,10 @@ def _by_lens(
     """The recording by that lens model by which the rows of its first pairs agree best."""
     other = "equidistant" if guessed == "radtan" else "radtan"
     both = {guessed: found, other: read(replace(settings, lens=other))}  # type: ignore[arg-type]
-    offsets = {name: np.concatenate(_first_offsets(each)) for name, each in both.items()}
+    offsets = {name: _first_rows(each) for name, each in both.items()}
     if max(map(len, offsets.values())) < _FEWEST_MATCHES:
         return found
-    rows = {n: float(np.median(np.abs(its[:, 1]))) if len(its) else np.inf
-            for n, its in offsets.items()}  # fmt: skip
+    rows = {n: float(np.median(np.abs(its))) if len(its) else np.inf for n, its in offsets.items()}
     best, worse = sorted(rows, key=lambda name: rows[name])
     chosen = both[best] if best == other else read(replace(settings, lens=best))  # type: ignore[arg-type]
     note = (
@@ -238,35 +238,47 @@ _ROW_PX = 2.0  # at 640 columns: rows of a sound pair agree within half a pixel
 _LEAST_SHARE = 1.0 / 3.0
 """Of matches whose rows agree, wrong matches included. Real pairs by their own calibration: 0.74 to
 0.96 (chessboards whose pattern repeats, a room); by another's: 0.01 to 0.16."""
+_BETTER = 0.8
+"""Of the rows' median difference in rectified images: what raw ones have less of, they fit better.
+The noise of matching is in both."""
+_OFF_PX = 0.5  # at 640 columns: less is noise of matching in images made smaller
 _MOST_NEGATIVE = 0.5
 """Of disparities: wrong matches make a tenth so."""
 
 
-def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str, ...]:
+def fit_notes(
+    load: Callable[[int], tuple[Image, ...]], count: int, rectifier: Rectifier
+) -> tuple[str, ...]:
     """What rectified pairs say against their calibration, in one line; empty where it fits.
+
+    It fits neither where rows disagree, nor where they agree better in the images as they are.
 
     Args:
         load: rectified images (right, left[, top]) of a frame, 0 <= index < count; may raise
             FrameError.
         count: how many frames there are.
+        rectifier: what rectified them.
     """
     pairs = _first_pairs(load, count)
     found = [_matched(*pair) for pair in pairs]
     if sum(map(len, found)) < _FEWEST_MATCHES:
         return ()
-    offsets = np.concatenate(found)
-    wide = pairs[0][0].shape[1]
-    limit = _ROW_PX * max(1.0, wide / 640.0)
-    share = float(np.mean(np.abs(offsets[:, 1]) < limit))
+    right, left = np.split(np.concatenate(found), 2, axis=1)
+    offsets, raw = left - right, _raw_rows(rectifier, right, left)
+    scale = max(1.0, pairs[0][0].shape[1] / 640.0)
+    share = float(np.mean(np.abs(offsets[:, 1]) < _ROW_PX * scale))
+    rows_px, raw_px = (float(np.median(np.abs(rows))) for rows in (offsets[:, 1], raw))
     negative = float(np.mean(offsets[:, 0] < 0.0))
     swapped = "; left and right look swapped" if negative > _MOST_NEGATIVE else ""
-    if share < _LEAST_SHARE:
-        middle = float(np.median(offsets[:, 1]))
+    raw_is_better = rows_px > _OFF_PX * scale and raw_px < _BETTER * rows_px
+    if share < _LEAST_SHARE or raw_is_better:
+        source = "" if rectifier.calibration is None else f" {rectifier.calibration.source}"
         return (
-            f"the calibration does not fit the images: in the first {len(found)} pairs the rows of "
-            f"{len(offsets)} matches differ by {middle:+.1f} px (median), {100.0 * share:.0f} % by "
-            f"less than {limit:.0f} px{swapped}; give the calibration of these cameras as they are "
-            "now, or swap left and right",
+            f"the calibration{source} does not fit these images: in the first {len(found)} pairs "
+            f"the rows of {len(offsets)} matches differ by {rows_px:.1f} px once rectified "
+            f"(median; {100.0 * share:.0f} % by less than {_ROW_PX * scale:.0f} px), by "
+            f"{raw_px:.1f} px as they are{swapped}; give the calibration of these cameras as they "
+            "are now, or swap left and right",
         )
     if swapped:
         return (
@@ -286,13 +298,28 @@ def _first_pairs(load: Callable[[int], tuple[Image, ...]], count: int) -> list[t
     return pairs
 
 
-def _first_offsets(recording: Recording) -> list[FloatArray]:
+def _first_rows(recording: Recording) -> FloatArray:
+    """(n,) rows in the left minus those in the right image, of matches in the first pairs."""
     pairs = _first_pairs(lambda i: recording.frame(i).images, len(recording))
-    return [np.empty((0, 2)), *(_matched(*pair) for pair in pairs)]
+    found = np.concatenate([np.empty((0, 4)), *(_matched(*pair) for pair in pairs)])
+    return np.asarray(found[:, 3] - found[:, 1])
+
+
+def _raw_rows(rectifier: Rectifier, right: FloatArray, left: FloatArray) -> FloatArray:
+    """(n,) how far pixels (n, 2) of the view lie apart across its rows in the raw images.
+
+    In pixels of the view, whose resolution and quarter turns the raw images need not have.
+    """
+    width, height = rectifier.rig.width, rectifier.rig.height
+    column = np.array([[0.5 * width, 0.25 * height], [0.5 * width, 0.75 * height]])
+    above, below = rectifier.raw_pixels(0, column)
+    down = (below - above) / (0.5 * height)
+    apart = rectifier.raw_pixels(1, left) - rectifier.raw_pixels(0, right)
+    return np.asarray(apart @ down / (down @ down))
 
 
 def _matched(right: Image, left: Image) -> FloatArray:
-    """(n, 2) column and row in the left minus those in the right image, of features that match."""
+    """(n, 4) column and row in the right, then in the left image, of features that match."""
     detector = cv2.SIFT.create(_FEATURES)
     factor = max(1, math.ceil(right.shape[1] / _WIDE_PX))
     size = (right.shape[1] // factor, right.shape[0] // factor)
@@ -301,7 +328,7 @@ def _matched(right: Image, left: Image) -> FloatArray:
         for image in (left, right)
     )
     if a is None or b is None or len(a) < 2 or len(b) < 2:
-        return np.empty((0, 2))
+        return np.empty((0, 4))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     back = {pair[0].queryIdx: pair[0].trainIdx for pair in matcher.knnMatch(a, b, 1)}
     kept = [
@@ -309,5 +336,5 @@ def _matched(right: Image, left: Image) -> FloatArray:
         for first, second in matcher.knnMatch(b, a, 2)
         if first.distance < _RATIO * second.distance and back[first.trainIdx] == first.queryIdx
     ]
-    moved = [np.subtract(there[j].pt, here[i].pt) for i, j in kept]
-    return np.asarray(factor * np.array(moved, np.float64).reshape(-1, 2))
+    places = [(*here[i].pt, *there[j].pt) for i, j in kept]
+    return np.asarray(factor * np.array(places, np.float64).reshape(-1, 4))

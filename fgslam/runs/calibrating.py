@@ -116,10 +116,11 @@ def calibrate_cameras(
     found = calibrate(board, views, size, model)
     checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
-    remarks = rig_of(calibration).remarks
+    rig = rig_of(calibration)
     others = _write(calibration, out, files, views, found)
     fit = _fit_lines(files, views, found)
-    lines = [*notes, *held, *fit, *_rig_verdict(board, found, checked), *remarks]
+    lines = [*notes, *held, *fit, f"rectified   {_view_words(rig)}"]
+    lines += [*_rig_verdict(board, found, checked), *rig.remarks]
     return [*lines, f"calibration {out}, with {', '.join(map(str, others))}"]
 
 
@@ -556,15 +557,18 @@ def _about(rig: StereoRig, found: Calibration) -> list[str]:
     lines = [f"rig: {', '.join(parts)}; baseline {1e3 * rig.baseline:.2f} mm"]
     if rig.vertical_baseline is not None:
         lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
-    view, what, overlap = rig.angles_deg, "rectified already", 1.0
-    if rig.rectifier is not None:
-        what, overlap = "rectified view", np.logical_and.reduce(rig.rectifier.masks).mean()
-    lines.append(
-        f"{what}: {rig.width}x{rig.height}, focal length {rig.fx:.1f} px, {view[0]:.0f} x "
-        f"{view[1]:.0f} degrees, {100.0 * overlap:.1f} % of it seen by all cameras; 1 px of "
-        f"disparity at {rig.fx * rig.baseline:.1f} m"
+    what = "rectified already" if rig.rectifier is None else "rectified view"
+    return [*lines, f"{what}: {_view_words(rig)}", *rig.remarks]
+
+
+def _view_words(rig: StereoRig) -> str:
+    """Size, focal length, angles and overlap of the rectified view."""
+    across, down = rig.angles_deg
+    return (
+        f"{rig.width}x{rig.height}, focal length {rig.fx:.1f} px, {across:.0f} x {down:.0f} "
+        f"degrees, the cameras overlap in {100.0 * rig.overlap:.1f} % of it; 1 px of disparity at "
+        f"{rig.fx * rig.baseline:.1f} m"
     )
-    return [*lines, *rig.remarks]
 
 
 def _draw(found: Calibration, rig: StereoRig | None, path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -44,10 +45,7 @@ def scene() -> FloatArray:
 def sampled(rig: StereoRig, camera: int, pixels: FloatArray) -> FloatArray:
     """Where rectified pixels (n, 2) of a camera look in its raw image, bilinear."""
     assert rig.rectifier is not None
-    columns, rows = (pixels[:, k].astype(np.float32)[:, None] for k in (0, 1))
-    maps = rig.rectifier.maps[camera]
-    found = [cv2.remap(one, columns, rows, cv2.INTER_LINEAR)[:, 0] for one in maps]
-    return np.column_stack(found).astype(float)
+    return rig.rectifier.raw_pixels(camera, pixels)
 
 
 def disagreement(rig: StereoRig, cameras: tuple[RawCamera, ...], points: FloatArray) -> FloatArray:
@@ -138,6 +136,49 @@ def test_two_cameras_above_each_other_are_rectified_by_a_quarter_turn(y: float) 
     assert f"{'ab'[upper]} is above {'ab'[1 - upper]}" in remark
     assert disagreement(rig, cameras, scene()).max() < 0.02
     assert (rig.width, rig.height) == SIZE[::-1]
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi / 2, np.pi, -np.pi / 2])
+@pytest.mark.parametrize("centre", [(2.0, 60.0), (157.0, 118.0), (79.0, -30.0), (-40.0, 3.0)])
+def test_a_cropped_sensor_fills_the_view(centre: tuple[float, float], turn: float) -> None:
+    """Wherever the principal point lies, in the image or beyond, and however cameras are rolled."""
+    about = so3_exp(np.array([0.0, 0.0, turn]))
+    cameras = tuple(
+        RawCamera(*SIZE, np.array([[120.0, 0, centre[0]], [0, 120.0, centre[1]], [0, 0, 1.0]]),
+                  np.array([-0.1, 0.02, 0.0, 0.0]),
+                  pose(one.bTc[:3, :3] @ about, one.bTc[:3, 3]), one.name)
+        for one in cameras_at((0.0, 0.0, 0.0), (0.12, 0.0, 0.0))
+    )  # fmt: skip
+    rig = rig_of(Calibration("made", "made", cameras))
+    assert rig.overlap == 1.0
+    assert 0.8 * 120.0 < rig.fx < 2.0 * 120.0
+    assert disagreement(rig, cameras, scene()).max() < 0.02
+
+
+def turned_apart(degrees: float) -> Calibration:
+    """Two cameras of 67 x 53 degrees that look away from each other."""
+    half = np.radians(0.5 * degrees)
+    cameras = [
+        camera((0.12 * k, 0.0, 0.0), (0.0, (2 * k - 1) * half, 0.0), "radtan", "ab"[k])
+        for k in (0, 1)
+    ]
+    return Calibration("made", "made", tuple(cameras))
+
+
+def test_the_overlap_of_a_view_is_stated_and_none_is_refused() -> None:
+    narrow = rig_of(turned_apart(40.0))
+    assert narrow.overlap == 1.0
+    assert narrow.angles_deg[0] < 40.0
+    wide = rig_of(turned_apart(40.0), fov_deg=120.0)
+    assert 0.02 < wide.overlap < 0.2
+    (remark,) = wide.remarks
+    assert remark == f"made: cameras share {wide.overlap:.0%} of the rectified view"
+    # Of the middle quarter of the sensor: 19 degrees each.
+    off = np.array([[0.0, 0.0, 60.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    apart = turned_apart(44.0)
+    cropped = tuple(replace(one, width=40, matrix=one.matrix - off) for one in apart.cameras)
+    with pytest.raises(CalibrationError, match="made: no place of the rectified view is seen by"):
+        rig_of(replace(apart, cameras=cropped))
 
 
 def test_baselines_that_are_not_square_are_told() -> None:

@@ -126,7 +126,7 @@ def test_a_calibration_in_words_and_as_a_picture(tmp_path: Path) -> None:
     assert [line.split()[0] for line in lines[1:4]] == ["camera", "0:", "1:"]
     length = 1e3 * float(np.linalg.norm(STEP[:3, 3]))
     assert f"right = c, left = c; baseline {length:.2f} mm" in lines[4]
-    assert "100.0 % of it seen by all cameras" in lines[5]
+    assert "the cameras overlap in 100.0 % of it" in lines[5]
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
