@@ -21,6 +21,8 @@ _CORNERS_OF_TAG = 4
 _LEAST_TAGS = 4
 _WINDOW_OF_TAG = 0.1  # of a tag's side, half the window of refinement: less than half the gap
 _WINDOW_OF_SQUARE = 0.2  # of the distance to the nearest corner, half the window of refinement
+_AROUND = 3.0  # largest distances of neighbours from the corners to where a board is looked for
+_SADDLES = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
 _LEAST_CORNERS = 6  # of which a pose follows with something left to judge it by
 
 
@@ -76,6 +78,20 @@ class Board:
         return np.column_stack([flat, np.zeros(len(flat))])
 
     @property
+    def renumberings(self) -> IntArray:
+        """(s, m) for each number the one after a turn with which the board looks the same.
+
+        The first changes none; without markers half a turn is not seen, nor of a square board a
+        quarter.
+        """
+        ids = np.arange(len(self.points))
+        if self.kind != "chessboard":
+            return ids[None]
+        grid = ids.reshape(self.rows, self.columns)
+        turns = range(0, 4, 1 if self.rows == self.columns else 2)
+        return np.array([np.rot90(grid, turn).ravel() for turn in turns])
+
+    @property
     def neighbours(self) -> IntArray:
         """(k, 2) numbers of corners that are one :attr:`square` apart."""
         points = self.points
@@ -98,8 +114,7 @@ def find_corners_of_wide(board: Board, image: Image, mirrored: bool = False) -> 
     found = find_corners(board, image, mirrored)
     if found is None or board.kind != "chessboard":
         return found
-    apart = np.linalg.norm(found.pixels[:, None] - found.pixels, axis=2)
-    nearest = (apart + np.diag(np.full(len(apart), np.inf))).min(axis=1)
+    nearest, _ = _to_neighbours(found.pixels)
     return Corners(found.ids, _refined(image, found.pixels, _WINDOW_OF_SQUARE * nearest))
 
 
@@ -109,6 +124,9 @@ def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners 
     ``mirrored``: the image may be one in a mirror, where no markers are known; a board of them is
     then looked for in its reflection as well. Reflected, a flat board is one seen from behind.
     """
+    # The same corners on every run: one thread, and random trees from one seed.
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
     finders = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": _aprilgrid}
     found = finders[board.kind](board, image)
     if found is not None or not mirrored or board.kind == "chessboard":
@@ -121,11 +139,32 @@ def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners 
 
 
 def _chessboard(board: Board, image: Image) -> Corners | None:
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), None, flags)
-    if not found:
-        return None
-    return Corners(np.arange(board.columns * board.rows), np.asarray(corners, float).reshape(-1, 2))
+    """By OpenCV's finder of saddles, looked for around where its finder of squares finds them.
+
+    Each finds boards that the other does not; saddles are more precise, squares faster.
+    """
+    size, ids = (board.columns, board.rows), np.arange(board.columns * board.rows)
+    known, squares = cv2.findChessboardCorners(image, size)
+    part, origin = image, np.zeros(2)
+    if known:
+        rough = np.asarray(squares, np.float64).reshape(-1, 2)
+        nearest, farthest = _to_neighbours(rough)
+        origin = np.floor(np.maximum(rough.min(axis=0) - _AROUND * farthest, 0.0))
+        column, row = origin.astype(int)
+        last_column, last_row = np.ceil(rough.max(axis=0) + _AROUND * farthest).astype(int)
+        part = np.ascontiguousarray(image[row : last_row + 1, column : last_column + 1])
+    for flags in (_SADDLES | cv2.CALIB_CB_NORMALIZE_IMAGE, _SADDLES):
+        found, corners = cv2.findChessboardCornersSB(part, size, None, flags)
+        if found:
+            return Corners(ids, np.asarray(corners, float).reshape(-1, 2) + origin)
+    return Corners(ids, _refined(image, rough, _WINDOW_OF_SQUARE * nearest)) if known else None
+
+
+def _to_neighbours(pixels: FloatArray) -> tuple[FloatArray, float]:
+    """Distances (n,) of corners (n, 2) to the nearest other, and the largest of these, pixels."""
+    apart = np.linalg.norm(pixels[:, None] - pixels, axis=2)
+    nearest = (apart + np.diag(np.full(len(apart), np.inf))).min(axis=1)
+    return nearest, float(nearest.max())
 
 
 def _charuco(board: Board, image: Image) -> Corners | None:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from fgslam.cameras.boards import Board, Corners
@@ -36,6 +35,8 @@ MOST_STEPS = 300
 """Of the fit; twenty are usual."""
 _FIRST_STEPS = 30  # with fixed distortion: from a rough start it becomes non-monotonic
 _STEP = 1e-6  # of the central differences: pixels, radians, metres, and parts of a lens of order 1
+_CONVERGED = 1e-10  # of the sum of squares that a step may still gain
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-12
 _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once in 270,000
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
 _TRIMMINGS = 4
@@ -63,6 +64,7 @@ class BoardCalibration:
         sigmas: (cameras, p) standard deviations of fx, fy, cx, cy and the model's parameters.
         turn_sigmas: (cameras, 6) of the turns, radians and metres; zero for the first.
         boards: (views, 6) pose of the board in the first camera; NaN where it was not used.
+        views: as given, with corners numbered alike in all cameras.
         kept: the corners of each view that were used; None where none were.
         errors: (views, cameras) root mean square distance in each image, pixels; NaN where unused.
         rms: the same of all corners that were used.
@@ -74,6 +76,7 @@ class BoardCalibration:
     sigmas: FloatArray
     turn_sigmas: FloatArray
     boards: FloatArray
+    views: tuple[View, ...]
     kept: tuple[View, ...]
     errors: FloatArray
     rms: float
@@ -98,7 +101,7 @@ def calibrate(
     seen = _sightings(board, views)
     used = np.ones(len(seen), np.bool_)
     _require_views(seen, used)
-    values, posed = _start(seen, size, model, len(views))
+    seen, values, posed = _start(board, seen, size, model, len(views))
     used = posed[seen.image]
     lens_from = len(INTRINSICS) + (1 if model == "omni" else 0)
     values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, lens_from)
@@ -126,9 +129,11 @@ def calibrate(
             "board; is --lens that of the camera, its focus fixed, and the board flat?"
         )
     errors = np.full((len(views), len(views[0])), np.nan)
-    kept: list[list[Corners | None]] = [[None] * len(views[0]) for _ in views]
+    numbered, kept = ([[None] * len(views[0]) for _ in views] for _ in range(2))
     for image, (v, c) in enumerate(seen.images):
-        own = used & (seen.image == image)
+        own = seen.image == image
+        numbered[v][c] = Corners(seen.ids[own], seen.pixels[own])
+        own &= used
         if own.any():
             errors[v, c] = _rms(away[own])
             kept[v][c] = Corners(seen.ids[own], seen.pixels[own])
@@ -145,6 +150,7 @@ def calibrate(
         sigmas.intrinsics,
         sigmas.turns,
         values.boards,
+        tuple(map(tuple, numbered)),
         tuple(map(tuple, kept)),
         errors,
         rms,
@@ -282,41 +288,66 @@ class _Fit:
         off = self.predicted(x) - self.seen.pixels
         return np.asarray(np.where(np.isfinite(off), off, np.hypot(*self.size))).ravel()
 
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        """(2n, p) of the residuals, by central differences.
+    def normal_equations(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (p, p) and its right side (p,), by central differences.
 
         A corner depends on one camera, its turn and one board: the k-th parameter of all cameras,
-        or of all boards, is moved at once.
+        or of all boards, is moved at once; corners of an image share their parameters.
         """
         n, step = len(self.seen.pixels), _STEP * np.maximum(1.0, np.abs(x))
-        out = np.zeros((n, 2, len(x)))
-        for column in self.columns.T:
+        slopes = np.zeros((n, 2, self.columns.shape[1]))
+        for k, column in enumerate(self.columns.T):
             of = np.flatnonzero(column >= 0)
             change = np.zeros(len(x))
             change[column[of]] = step[column[of]]
             moved = self.predicted(x + change) - self.predicted(x - change)
             slope = moved[of] / (2.0 * step[column[of]])[:, None]
-            out[of, :, column[of]] = np.where(np.isfinite(slope), slope, 0.0)
-        return out.reshape(2 * n, len(x))
+            slopes[of, :, k] = np.where(np.isfinite(slope), slope, 0.0)
+        off = self.residuals(x).reshape(n, 2)
+        information, right_side = np.zeros((len(x), len(x))), np.zeros(len(x))
+        for rows in np.split(np.arange(n), np.flatnonzero(np.diff(self.seen.image)) + 1):
+            columns = self.columns[rows[0]]
+            on = columns[columns >= 0]
+            jacobian = slopes[rows][:, :, columns >= 0].reshape(-1, len(on))
+            information[np.ix_(on, on)] += jacobian.T @ jacobian
+            right_side[on] += jacobian.T @ off[rows].ravel()
+        return information, right_side
 
     def least(self, steps: int, fixed_from: int | None = None) -> _Values:
         """The values of the least residuals; each camera's parameters from one on may be fixed."""
-        return self.parts(self._solve(steps, fixed_from).x)
+        return self.parts(self._solve(steps, fixed_from)[0])
 
-    def _solve(self, steps: int, fixed_from: int | None) -> Any:
-        own = np.arange(self.splits[0])
-        each = self.values.intrinsics.shape[1]
+    def _solve(self, steps: int, fixed_from: int | None) -> tuple[FloatArray, bool]:
+        """Parameters (p,) by Levenberg's and Marquardt's method, and whether it converged."""
+        x = self.vector(self.values)
+        own, each = np.arange(self.splits[0]), self.values.intrinsics.shape[1]
         fixed = own[own % each >= (each if fixed_from is None else fixed_from)]
-
-        def jacobian(x: FloatArray) -> FloatArray:
-            out = self.jacobian(x)
-            out[:, fixed] = 0.0
-            return out
-
-        start = self.vector(self.values)
-        return least_squares(
-            self.residuals, start, jacobian, method="lm", x_scale="jac", max_nfev=steps
-        )
+        free = np.setdiff1d(np.arange(len(x)), fixed)
+        cost, damping, growth = float(np.sum(self.residuals(x) ** 2)), _FIRST_DAMPING, 2.0
+        scale = np.full(len(free), np.finfo(float).tiny)
+        for _ in range(steps):
+            information, right_side = self.normal_equations(x)
+            scale = np.maximum(scale, np.sqrt(np.diag(information)[free]))
+            information = information[np.ix_(free, free)] / np.outer(scale, scale)
+            slope = right_side[free] / scale
+            while True:
+                step = np.linalg.solve(information + damping * np.eye(len(free)), slope)
+                trial = x.copy()
+                trial[free] -= step / scale
+                gain = cost - float(np.sum(self.residuals(trial) ** 2))
+                expected = float(step @ (damping * step + slope))
+                if gain > 0.0:
+                    break
+                damping, growth = growth * damping, 2.0 * growth
+                if expected < _CONVERGED * cost:
+                    return x, True  # but for rounding nothing is less
+            # Nielsen's rule: by how well the step was foreseen.
+            damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / expected - 1.0) ** 3)
+            damping, growth = max(damping, _LEAST_DAMPING), 2.0
+            x, cost = trial, cost - gain
+            if gain < _CONVERGED * cost:
+                return x, True
+        return x, False
 
     def solution(self) -> tuple[_Values, _Values]:
         """The values of the least residuals, and their standard deviations.
@@ -324,17 +355,17 @@ class _Fit:
         Raises:
             CalibrationError: the corners do not determine them, or the fit does not converge.
         """
-        fit = self._solve(MOST_STEPS, None)
-        jacobian = self.jacobian(fit.x)
-        scale = np.linalg.norm(jacobian, axis=0)
+        x, converged = self._solve(MOST_STEPS, None)
+        information, off = self.normal_equations(x)[0], self.residuals(x)
+        scale = np.sqrt(np.diag(information))
         if not (np.isfinite(scale).all() and scale.all()):
             raise CalibrationError(_UNDETERMINED)
-        information = (jacobian / scale).T @ (jacobian / scale)
-        left = len(fit.fun) - len(fit.x)
+        information /= np.outer(scale, scale)
+        left = len(off) - len(x)
         if left <= 0 or not np.linalg.cond(information) <= 1e14:
             raise CalibrationError(_UNDETERMINED)
-        covariance = 2.0 * fit.cost / left * np.linalg.inv(information) / np.outer(scale, scale)
-        values, own = self.parts(fit.x), self.values.intrinsics.shape[1]
+        covariance = off @ off / left * np.linalg.inv(information) / np.outer(scale, scale)
+        values, own = self.parts(x), self.values.intrinsics.shape[1]
         for camera, numbers in enumerate(values.intrinsics):
             at = slice(camera * own, (camera + 1) * own)
             by = np.zeros(own)
@@ -347,7 +378,7 @@ class _Fit:
                 raise CalibrationError(_UNDETERMINED) from None
             if not by @ covariance[at, at] @ by <= _UNCERTAIN**2:
                 raise CalibrationError(_UNDETERMINED)
-        if not fit.success:
+        if not converged:
             raise CalibrationError(
                 f"the fit of the {self.model} cameras does not converge in {MOST_STEPS} steps; try "
                 "another --lens, or leave out images in which corners were found wrongly"
@@ -367,9 +398,13 @@ _LEAST = 4  # points from which a pose follows
 
 
 def _start(
-    seen: _Sightings, size: tuple[int, int], model: str, views: int
-) -> tuple[_Values, BoolArray]:
-    """First values, and in which images (k,) the board has a pose."""
+    board: Board, seen: _Sightings, size: tuple[int, int], model: str, views: int
+) -> tuple[_Sightings, _Values, BoolArray]:
+    """The corners, first values, and in which images (k,) the board has a pose.
+
+    Where a board looks the same after a turn, its corners are numbered alike in all cameras: with
+    the wrong number each view would have other poses of the cameras to each other.
+    """
     images = [seen.image == k for k in range(len(seen.images))]
     count = 1 + max(c for _, c in seen.images)
     intrinsics = []
@@ -378,30 +413,43 @@ def _start(
         flat, pixels = ([each[at] for at in own] for each in (seen.points, seen.pixels))
         intrinsics.append(first_guess(model, flat, pixels, size))
     cameras = [camera_of(model, size, numbers) for numbers in intrinsics]
-    cTb = {
-        (v, c): found
-        for at, (v, c) in zip(images, seen.images, strict=True)
-        if (found := board_pose(cameras[c], seen.points[at], seen.pixels[at])) is not None
-    }
+    # Of each image the board's poses, one for each way to number its corners.
+    ways = board.renumberings
+    cTbs: dict[tuple[int, int], list[FloatArray]] = {}
+    for at, (v, c) in zip(images, seen.images, strict=True):
+        poses = [board_pose(cameras[c], board.points[way[seen.ids[at]]], seen.pixels[at])
+                 for way in ways]  # fmt: skip
+        if known := [cTb for cTb in poses if cTb is not None]:
+            cTbs[v, c] = known
     turns = [np.eye(4)]
     for camera in range(1, count):
-        # Of the poses that single views give the one nearest to all others.
-        shown = [v for v, c in cTb if c == camera and (v, 0) in cTb]
-        both = [cTb[v, camera] @ inverse(cTb[v, 0]) for v in shown]
-        if not both:
+        both = np.array(
+            [[cTb @ inverse(cTbs[v, 0][0]) for cTb in found]
+             for (v, c), found in cTbs.items() if c == camera and (v, 0) in cTbs]
+        )  # fmt: skip
+        if not len(both):
             raise CalibrationError(
                 f"cameras 0 and {camera} never see the board at the same time; are the images "
                 "paired rightly?"
             )
-        apart = [[np.linalg.norm(a - b) for b in both] for a in both]
-        turns.append(both[int(np.argmin(np.sum(apart, axis=1)))])
-    boards = np.full((views, 6), np.nan)
-    for (v, c), found in reversed(cTb.items()):  # by the first camera that sees it
-        boards[v] = _turn_of(inverse(turns[c]) @ found if c else found)
-    values = _Values(np.array(intrinsics), np.array([_turn_of(turn) for turn in turns]), boards)
-    if not all(np.isfinite(one).all() for one in (*values[:2], boards[[v for v, _ in cTb]])):
+        # Of the poses that single views give, with any numbering, the one nearest to all others.
+        apart = np.linalg.norm(both[:, :, None, None] - both, axis=(4, 5)).min(axis=3).sum(axis=2)
+        turns.append(both[np.unravel_index(int(np.argmin(apart)), apart.shape)])
+    boards, chosen = np.full((views, 4, 4), np.nan), np.zeros(len(images), np.int64)
+    for image, (v, c) in enumerate(seen.images):
+        if (found := cTbs.get((v, c))) is None:
+            continue
+        here = [inverse(turns[c]) @ cTb for cTb in found]
+        if np.isnan(boards[v, 0, 0]):  # by the first camera that sees it
+            boards[v] = here[0]
+        chosen[image] = int(np.argmin([np.linalg.norm(one - boards[v]) for one in here]))
+    ids = ways[chosen[seen.image], seen.ids]
+    seen = replace(seen, ids=ids, points=board.points[ids])
+    six = np.array([np.full(6, np.nan) if np.isnan(one[0, 0]) else _turn_of(one) for one in boards])
+    values = _Values(np.array(intrinsics), np.array([_turn_of(turn) for turn in turns]), six)
+    if not all(np.isfinite(one).all() for one in (*values[:2], six[[v for v, _ in cTbs]])):
         raise CalibrationError(_UNDETERMINED)
-    return values, np.array([image in cTb for image in seen.images])
+    return seen, values, np.array([image in cTbs for image in seen.images])
 
 
 def first_guess(

@@ -50,6 +50,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
 from fgslam.core.sensors import CAMERA_NAMES
+from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.layouts import find_cameras, images_in
 from fgslam.datasets.times import pair_files
@@ -91,6 +92,7 @@ def _require_model(model: str, known: Sequence[str]) -> None:
         raise ConfigError(f"lens {model!r} is not known; use {' or '.join(known)}")
 
 
+@one_blas_thread()
 def calibrate_cameras(
     folders: Sequence[Path], board: Board, model: str, out: Path, progress: Progress
 ) -> list[str]:
@@ -114,7 +116,7 @@ def calibrate_cameras(
     files, notes = _files(folders)
     views, size, held = _views(files, board, partial(find_corners, board), progress)
     found = calibrate(board, views, size, model)
-    checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
+    checked = [held_out(board, found.views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
     rig = rig_of(calibration)
     others = _write(calibration, out, files, views, found)
@@ -124,6 +126,7 @@ def calibrate_cameras(
     return [*lines, f"calibration {out}, with {', '.join(map(str, others))}"]
 
 
+@one_blas_thread()
 def calibrate_wide_camera(
     folder: Path, board: Board, model: str, mount: str, out: Path, progress: Progress
 ) -> list[str]:
@@ -404,6 +407,7 @@ def _names(found: BoardCalibration) -> tuple[str, ...]:
 # Mirrors
 
 
+@one_blas_thread()
 def calibrate_mirror(
     image: Path, elevations_deg: Sequence[float], inner_px: float, out: Path
 ) -> list[str]:
