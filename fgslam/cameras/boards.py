@@ -21,7 +21,6 @@ _CORNERS_OF_TAG = 4
 _LEAST_TAGS = 4
 _WINDOW_OF_TAG = 0.1  # of a tag's side, half the window of refinement: less than half the gap
 _WINDOW_OF_SQUARE = 0.2  # of the distance to the nearest corner, half the window of refinement
-_AROUND = 3.0  # largest distances of neighbours from the corners to where a board is looked for
 _SADDLES = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
 _LEAST_CORNERS = 6  # of which a pose follows with something left to judge it by
 
@@ -105,19 +104,6 @@ def _grid(columns: int, rows: int) -> FloatArray:
     return np.column_stack([column, row]).astype(np.float64)
 
 
-def find_corners_of_wide(board: Board, image: Image, mirrored: bool = False) -> Corners | None:
-    """As :func:`find_corners`, a chessboard's refined in small windows.
-
-    OpenCV's finder expects the straight lines of a perspective image: far from the axis of a
-    fisheye it is off by pixels.
-    """
-    found = find_corners(board, image, mirrored)
-    if found is None or board.kind != "chessboard":
-        return found
-    nearest, _ = _to_neighbours(found.pixels)
-    return Corners(found.ids, _refined(image, found.pixels, _WINDOW_OF_SQUARE * nearest))
-
-
 def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners | None:
     """Corners of the board in a grey image (height, width) uint8; None where it is not found.
 
@@ -139,32 +125,22 @@ def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners 
 
 
 def _chessboard(board: Board, image: Image) -> Corners | None:
-    """By OpenCV's finder of saddles, looked for around where its finder of squares finds them.
+    """By OpenCV's finder of squares, else of saddles: each finds boards that the other does not.
 
-    Each finds boards that the other does not; saddles are more precise, squares faster.
+    Corners are refined in windows as small as the squares: the finder of saddles expects straight
+    lines, and is off by pixels far from the axis of a fisheye.
     """
-    size, ids = (board.columns, board.rows), np.arange(board.columns * board.rows)
-    known, squares = cv2.findChessboardCorners(image, size)
-    part, origin = image, np.zeros(2)
-    if known:
-        rough = np.asarray(squares, np.float64).reshape(-1, 2)
-        nearest, farthest = _to_neighbours(rough)
-        origin = np.floor(np.maximum(rough.min(axis=0) - _AROUND * farthest, 0.0))
-        column, row = origin.astype(int)
-        last_column, last_row = np.ceil(rough.max(axis=0) + _AROUND * farthest).astype(int)
-        part = np.ascontiguousarray(image[row : last_row + 1, column : last_column + 1])
+    size = board.columns, board.rows
+    found, corners = cv2.findChessboardCorners(image, size)
     for flags in (_SADDLES | cv2.CALIB_CB_NORMALIZE_IMAGE, _SADDLES):
-        found, corners = cv2.findChessboardCornersSB(part, size, None, flags)
-        if found:
-            return Corners(ids, np.asarray(corners, float).reshape(-1, 2) + origin)
-    return Corners(ids, _refined(image, rough, _WINDOW_OF_SQUARE * nearest)) if known else None
-
-
-def _to_neighbours(pixels: FloatArray) -> tuple[FloatArray, float]:
-    """Distances (n,) of corners (n, 2) to the nearest other, and the largest of these, pixels."""
+        if not found:
+            found, corners = cv2.findChessboardCornersSB(image, size, None, flags)
+    if not found:
+        return None
+    pixels = np.asarray(corners, np.float64).reshape(-1, 2)
     apart = np.linalg.norm(pixels[:, None] - pixels, axis=2)
     nearest = (apart + np.diag(np.full(len(apart), np.inf))).min(axis=1)
-    return nearest, float(nearest.max())
+    return Corners(np.arange(len(pixels)), _refined(image, pixels, _WINDOW_OF_SQUARE * nearest))
 
 
 def _charuco(board: Board, image: Image) -> Corners | None:

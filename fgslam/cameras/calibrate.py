@@ -129,7 +129,8 @@ def calibrate(
             "board; is --lens that of the camera, its focus fixed, and the board flat?"
         )
     errors = np.full((len(views), len(views[0])), np.nan)
-    numbered, kept = ([[None] * len(views[0]) for _ in views] for _ in range(2))
+    numbered: list[list[Corners | None]] = [[None] * len(views[0]) for _ in views]
+    kept: list[list[Corners | None]] = [[None] * len(views[0]) for _ in views]
     for image, (v, c) in enumerate(seen.images):
         own = seen.image == image
         numbered[v][c] = Corners(seen.ids[own], seen.pixels[own])

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from fgslam.cameras.boards import Board, Corners, find_corners, find_corners_of_wide, sizes_that_fit
+from fgslam.cameras.boards import Board, Corners, find_corners, sizes_that_fit
 from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.calibrate import (
     DEPTH_SHARE,
@@ -159,7 +159,7 @@ def calibrate_wide_camera(
     files = [(path,) for path in images_in(folder)]
     if not files:
         raise DatasetError(f"{folder}: holds no images; give the folder of the board's images")
-    finder = partial(find_corners_of_wide, board, mirrored=mount == "mirror")
+    finder = partial(find_corners, board, mirrored=mount == "mirror")
     views, size, held = _views(files, board, finder, progress)
     found = calibrate(board, views, size, model)
     checked = held_out_alone(board, views, size, model)

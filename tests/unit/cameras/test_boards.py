@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
@@ -32,6 +34,75 @@ def test_a_chessboard_is_found_and_another_size_is_named() -> None:
     wrong = Board("chessboard", 8, 5, 0.02)
     assert find_corners(wrong, image) is None
     assert sizes_that_fit(wrong, image) == ["7x5"]
+
+
+SEEN_AT = np.array([[60, 50], [400, 90], [380, 320], [90, 280]], np.float32)
+
+
+def slanted(image: np.ndarray) -> tuple[np.ndarray, FloatArray]:
+    """An image of a printed board seen from the side, and the homography."""
+    height, width = image.shape
+    edge = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    turn = cv2.getPerspectiveTransform(edge, SEEN_AT)
+    seen = cv2.warpPerspective(image, turn, (480, 360), borderValue=120)
+    return np.asarray(seen, np.uint8), np.asarray(turn, np.float64)
+
+
+def cluttered(image: np.ndarray) -> np.ndarray:
+    """Squares of other sizes around the board: no finder of saddles alone tells them apart."""
+    white, _ = slanted(np.full((248, 296), 255, np.uint8))
+    noise = np.random.default_rng(0).integers(0, 2, (36, 48), np.uint8) * 255
+    around = cv2.resize(noise, (480, 360), interpolation=cv2.INTER_NEAREST)
+    return np.where(white > 250, image, around)
+
+
+def strung(image: np.ndarray) -> np.ndarray:
+    """A white string before the board, which joins its squares."""
+    return cv2.line(image.copy(), (0, 200), (480, 150), 255, 8)
+
+
+def blurred(image: np.ndarray) -> np.ndarray:
+    """Far out of focus."""
+    return cv2.GaussianBlur(image, (0, 0), 9)
+
+
+@pytest.mark.parametrize("spoilt", [cluttered, strung, blurred])
+def test_a_chessboard_is_found_where_one_finder_of_opencv_finds_it(
+    spoilt: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    printed = chessboard(8, 6)
+    image, turn = slanted(printed)
+    board = Board("chessboard", 8, 6, 0.02)
+    found = find_corners(board, spoilt(image))
+    assert found is not None
+    # Squares of 24 pixels, the first corner after 40 of margin and one square.
+    true = cv2.perspectiveTransform(24.0 * board.points[None, :, :2] / 0.02 + 63.5, turn)[0]
+    ways = [found.pixels[np.argsort(way)] for way in board.renumberings]
+    off = min(np.median(np.linalg.norm(pixels - true, axis=1)) for pixels in ways)
+    assert off < (2.0 if spoilt is blurred else 0.2)
+
+
+def test_boards_look_the_same_after_some_turns() -> None:
+    """Half a turn of any chessboard, a quarter of a square one; none of boards with markers."""
+    half = Board("chessboard", 3, 2, 0.1).renumberings
+    np.testing.assert_array_equal(half, [np.arange(6), np.arange(6)[::-1]])
+    square = Board("chessboard", 3, 3, 0.1)
+    assert len(square.renumberings) == 4
+    for way in square.renumberings:
+        origin, right, down = square.points[way[[0, 1, 3]], :2]
+        assert np.linalg.det([right - origin, down - origin]) == pytest.approx(0.01)
+    assert len(Board("charuco", 4, 4, 0.1).renumberings) == 1
+
+
+def test_corners_do_not_depend_on_threads_or_on_what_was_found_before() -> None:
+    image = strung(slanted(chessboard(8, 6))[0])
+    found = []
+    for threads in (1, 4):
+        cv2.setNumThreads(threads)
+        corners = find_corners(Board("chessboard", 8, 6, 0.02), image)
+        assert corners is not None
+        found.append(corners.pixels)
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_corners_of_an_aprilgrid_lie_on_its_plane_whatever_way_the_tags_are_turned() -> None:

@@ -57,10 +57,12 @@ def rig(model: str, cameras: int) -> list[RawCamera]:
     ]
 
 
-def seen_by(cameras: list[RawCamera], rng: np.random.Generator, count: int = 14) -> list[View]:
+def seen_by(
+    cameras: list[RawCamera], rng: np.random.Generator, count: int = 14, board: Board = BOARD
+) -> list[View]:
     """Boards at random before the cameras; corners outside an image are not seen by it."""
     views: list[View] = []
-    centred = BOARD.points - BOARD.points.mean(axis=0)
+    centred = board.points - board.points.mean(axis=0)
     while len(views) < count:
         away = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(0.3, 0.7)])
         points = centred @ so3_exp(rng.uniform(-0.5, 0.5, 3)).T + away
@@ -125,6 +127,35 @@ def test_corners_that_were_found_wrongly_are_left_out() -> None:
     found = calibrate(BOARD, views, SIZE, "radtan")
     assert spoilt <= found.left_out <= spoilt + 3
     assert normalised_error(found, true) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "rolled"),
+    [
+        (8, 6, np.pi),
+        pytest.param(8, 6, 0.0, marks=pytest.mark.slow),
+        pytest.param(6, 6, 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_boards_that_look_the_same_after_a_turn_are_numbered_alike(
+    columns: int, rows: int, rolled: float
+) -> None:
+    """The right camera, which may hang upside down, sees half of the boards turned."""
+    board, rng = Board("chessboard", columns, rows, 0.04), np.random.default_rng(2)
+    left, right = rig("radtan", 2)
+    right = replace(right, bTc=right.bTc @ se3_exp(np.array([0, 0, rolled, 0, 0, 0])))
+    ways, straight = board.renumberings, seen_by([left, right], rng, 12, board)
+    turned: list[View] = []
+    for k, (a, b) in enumerate(straight):
+        way = ways[k % len(ways)]
+        turned.append((a, None if b is None else Corners(way[b.ids], b.pixels)))
+    expected, found = (calibrate(board, views, SIZE, "radtan") for views in (straight, turned))
+    assert found.left_out == expected.left_out
+    np.testing.assert_allclose(found.turns, expected.turns, rtol=0, atol=1e-6)
+    assert np.linalg.norm(found.turns[1, 3:]) == pytest.approx(0.1, rel=0.01)
+    shown = judged(board, found, found.views, 1)
+    assert shown is not None
+    assert shown.square == pytest.approx(0.04, rel=2e-3)
 
 
 def test_held_out_images_show_rows_and_squares() -> None:
