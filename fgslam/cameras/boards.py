@@ -78,7 +78,7 @@ class Board:
 
     @property
     def renumberings(self) -> IntArray:
-        """(s, m) for each number the one after a turn with which the board looks the same.
+        """(s, m) for each number the one after a turn with which the board is the same to the eye.
 
         The first changes none; without markers half a turn is not seen, nor of a square board a
         quarter.

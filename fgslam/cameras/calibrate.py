@@ -403,7 +403,7 @@ def _start(
 ) -> tuple[_Sightings, _Values, BoolArray]:
     """The corners, first values, and in which images (k,) the board has a pose.
 
-    Where a board looks the same after a turn, its corners are numbered alike in all cameras: with
+    Where a board is the same after a turn, its corners are numbered alike in all cameras: with
     the wrong number each view would have other poses of the cameras to each other.
     """
     images = [seen.image == k for k in range(len(seen.images))]
