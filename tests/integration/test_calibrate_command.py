@@ -157,7 +157,7 @@ def test_a_few_real_images_calibrate_and_are_called_few(
     assert main(monkeypatch, "calibrate", "stereo", *folders, *sizes) == 0
     told = capfd.readouterr().out
     assert "verdict     doubtful" in told
-    assert "only 5 moments" in told
+    assert "only 6 moments" in told
     assert fg.load_rig(out).baseline == pytest.approx(0.0829, rel=0.02)
     assert [camera["model"] for camera in json.loads(out.read_text())["cameras"]] == ["radtan"] * 2
 
