@@ -13,7 +13,7 @@ To add an estimator:
 2. Where it can do more, add the members of :class:`~fgslam.core.store.Resumable` (interrupted runs;
    or mark what it keeps as :class:`~fgslam.core.store.Kept`), :class:`FullEstimator` or
    :class:`MapUser` (beginning in a saved map). What asks for them refuses an estimator without, in
-   one line. A ``recalibrate(correction)`` follows a rig that calibrates itself
+   one line. A ``recalibrate(correction, since)`` follows a rig that calibrates itself
    (:func:`recalibrated`); ``noise_factors``, on the stated deviations of a single measurement and
    as it is weighed, is only shown.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
@@ -148,14 +148,15 @@ def predicted(estimator: Estimator, odometry: Odometry | None) -> Prediction:
     return prediction
 
 
-def recalibrated(estimator: Estimator, correction: FloatArray | None) -> None:
+def recalibrated(estimator: Estimator, correction: FloatArray | None, since: int) -> None:
     """Hands the correction (p,) of the next frame to an estimator that has a ``recalibrate``.
 
-    Landmarks that were measured with another one, and are contradicted, move to where this one
-    would have put them; those of a saved map stay. None: there is no correction.
+    Landmarks that were measured with another one move to where this one would have put them; those
+    of a saved map stay, and those seen last before frame ``since`` (from 0), from which on the rig
+    is as it is now. None: there is no correction.
     """
     if correction is not None and hasattr(estimator, "recalibrate"):
-        estimator.recalibrate(correction)
+        estimator.recalibrate(correction, since)
 
 
 def updated(estimator: Estimator, increment: Increment, tracking: EgoMotion) -> UpdateStats:

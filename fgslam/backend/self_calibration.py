@@ -1,28 +1,29 @@
 """A rig that calibrates itself from the drive: an information filter over its correction.
 
-Windows of frames that share no image give evidence, which is added up, with the noise that the
-windows themselves show by how far they disagree. Nothing is known of the truth. Derived in
-docs/derivations/cameras.md.
+Windows of frames that share no image say what they show of the correction and of nuisances
+together; this is added up, with the noise that the windows themselves show by how far they
+disagree. Nothing is known of the truth. Derived in docs/derivations/cameras.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import block_diag
 
-from fgslam.backend.considered import pixels_of
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
+from fgslam.core.arrays import BoolArray, FloatArray, chi_square_quantile
 from fgslam.core.correction import (
+    BASELINE_TERMS,
+    FIELD_PX,
+    TERMS,
     RigCorrection,
     displacements,
-    early_terms,
-    field_displacements,
     field_modes,
+    nuisance_displacements,
+    nuisance_information,
     prior_information,
     term_names,
 )
@@ -49,13 +50,13 @@ from fgslam.core.store import Kept
 WINDOW = 6
 """Frames of one window: motion enough to see depth change, few enough to cost little."""
 
-TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, next to the observed one
-_DRIFT_S = 3600.0  # seconds after which as much is unknown as the calibration itself leaves
-SETTLING = WINDOW * (int(TRUSTED_WINDOWS) + 1)
-"""Frames before which no change of the correction can be a rig that was found to have moved."""
+TRUSTED_WINDOWS = 4  # how many windows the stated noise and shake are worth, next to those observed
+_DECIDING = 4
+"""Windows after a suspected knock for which both hypotheses are kept: one rig, or two."""
+_DRIFT_S = 3600.0  # seconds in which evidence fades by a factor e
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class CalibrationStep:
     """What was known after one window.
 
@@ -73,39 +74,40 @@ class CalibrationStep:
     applied: FloatArray
     knocks: int
 
-    @staticmethod
-    def of(timestamp: float, found: WeighedCorrection, knocks: int) -> CalibrationStep:
-        """The step after a window that ended at ``timestamp``."""
-        known, applied = found.estimated, found.applied.values
-        return CalibrationStep(timestamp, known.values, known.covariance, applied, knocks)
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Window:
+    """One window: what was known before it, what it shows, and its first frame.
 
-def _accepted(increment: Increment) -> Observations:
-    """What the ego-motion accepted."""
-    return increment.observations.select(~increment.rejected)
+    ``unlikely``: what was known cannot explain it.
+    """
+
+    before: RigFilter
+    evidence: RigEvidence
+    first: int
+    unlikely: bool
 
 
 class SelfCalibration:
     """Estimates the correction of a rig while it is driven."""
 
-    _whole: Kept[RigFilter]
-    _early: Kept[RigFilter]
-    _field: Kept[FieldSize]
+    _known: Kept[RigFilter]
+    _recent: Kept[list[_Window]]
     _applied: Kept[FloatArray]
     steps: Kept[list[CalibrationStep]]
     windows: Kept[int]
     knocks: Kept[int]
-    _suspected: Kept[bool]
+    _since: Kept[int]
+    _seen: Kept[int]
     _frames: Kept[list[tuple[FloatArray, Observations]]]
     _last_time: Kept[float | None]
 
     def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
         """Begins with the calibration as stated; ``pixel_sigma`` of one coordinate, pixels."""
-        self._rig, early = rig, early_terms(rig)
-        self._whole = RigFilter.of(rig, np.ones_like(early))
-        self._early = RigFilter.of(rig, early)
-        self._field = FieldSize(rig, pixel_sigma)
-        self.found = self._weighed()
+        self._unknowns = RigUnknowns(rig)
+        self._known = RigFilter.none(self._unknowns)
+        self._recent = []
+        self.found = self._known.weighed(self._unknowns)
         """As known now, and what of it is worth applying."""
         self.steps = []
         """How it became known, window by window."""
@@ -114,7 +116,7 @@ class SelfCalibration:
         self.knocks = 0
         """How often the rig was found to have moved."""
         self._applied = self.found.applied.values
-        self._suspected = False
+        self._since, self._seen = 0, 0
         self._sigma = pixel_sigma
         self._frames = []
         self._last_time = None
@@ -122,26 +124,29 @@ class SelfCalibration:
     @property
     def noise_factor(self) -> float:
         """Variance of the windows' evidence, as multiple of what their pixels alone would give."""
-        return self._whole.noise_factor
+        return self._known.noise_factor(self._unknowns)
 
     @property
     def field_px(self) -> float:
         """What no term follows: standard deviation of one coordinate in each image, pixels."""
-        return self._field.px
+        return self._known.field_px
+
+    @property
+    def shake_px(self) -> float:
+        """By how much images move against each other from frame to frame: deviation, pixels."""
+        return float(self._known.shake * self._unknowns.rig.fx)
 
     @property
     def settled(self) -> SettledRig:
-        """What all frames since the rig was moved last are best corrected by, as known now."""
-        settled = self.found.settled
-        return SettledRig(None if settled is None else settled.values, self.knocks, self.field_px)
+        """Since when the rig is as it is now, and what no term follows."""
+        return SettledRig(self.knocks, self._since, self.field_px)
 
     def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
         if increment.relocalised:
             self._frames.clear()
-        accepted = _accepted(increment)
-        self._field.observe(accepted)
-        self._frames.append((wTc, accepted))
+        self._frames.append((wTc, increment.kept))
+        self._seen += 1
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []
             self._take(frames, increment.timestamp)
@@ -150,61 +155,89 @@ class SelfCalibration:
     def _take(self, frames: list[tuple[FloatArray, Observations]], timestamp: float) -> None:
         since = 0.0 if self._last_time is None else timestamp - self._last_time
         self._last_time = timestamp
-        filters = [of.grown(since / _DRIFT_S) for of in (self._early, self._whole)]
-        found = [of.evidence_of(self._rig, frames, self._sigma) for of in filters]
-        evidence = [one for one in found if one is not None]
-        if len(evidence) < len(filters):
+        of, before = self._unknowns, self._known.faded(since / _DRIFT_S)
+        alignment = RigAlignment(of, frames, self._sigma, before.shake)
+        evidence = alignment.evidence(before.values(of), before.precision(of))
+        if evidence is None:
             return
         self.windows += 1
-        judged = [of.judged(one) for of, one in zip(filters, evidence, strict=True)]
-        if judged[0][0] and self.windows > TRUSTED_WINDOWS:
-            if not self._suspected:  # once is something that passed through the view
-                self._suspected = True
-                return
+        unlikely, judged = before.judged(of, evidence)
+        unlikely &= self.windows > TRUSTED_WINDOWS
+        if unlikely:  # linearised where the window itself would go
+            other = before.without_terms(of)
+            evidence = alignment.evidence(other.values(of), other.precision(of)) or evidence
+        window = _Window(before, evidence, self._seen - len(frames), unlikely)
+        self._recent = [*self._recent[-1 - _DECIDING :], window]
+        self._known = judged.after(of, evidence)
+        moved = self._moved_in()
+        if moved is not None:
             self.knocks += 1
-            filters = [of.grown(1.0) for of in filters]
-        else:
-            filters = [of for _, of in judged]
-        self._suspected = False
-        pairs = zip(filters, evidence, strict=True)
-        self._early, self._whole = (of.after(one) for of, one in pairs)
-        self.found = self._held(self._weighed())
+            self._since = self._recent[moved].first
+            (gap, _, *after), self._recent = self._recent, []
+            self._known = gap.before.without_terms(of)
+            for one in after:
+                self._known = self._known.judged(of, one.evidence)[1].after(of, one.evidence)
+        self.found = self._held(self._known.weighed(of))
         self._applied = self.found.applied.values
-        self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
+        known = self.found.estimated.values, self.found.estimated.covariance
+        self.steps.append(CalibrationStep(timestamp, *known, self._applied, self.knocks))
 
-    # ----------------------------------------------------------------------------------------
+    def _moved_in(self) -> int | None:
+        """In which of the two oldest recent windows the rig has moved; None: in neither.
+
+        Two rigs, before and after, then explain the windows far better than one, with the same
+        nuisances; better than if it had moved later; and they differ over the whole image.
+        """
+        if len(self._recent) < 2 + _DECIDING or not any(one.unlikely for one in self._recent):
+            return None
+        of, moves = self._unknowns, [self._moved(k) for k in range(len(self._recent))]
+        sure = [move.significance() for move in moves]
+        first = int(np.argmax(sure))
+        likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, of.terms)
+        knocked = first < 2 and sure[first] > likely and moves[first].rms_px() > _KNOCK_PX
+        return first if knocked else None
+
+    def _moved(self, first: int) -> RigCorrection:
+        """By how much the rig differs from a recent window on, if all before are of one rig."""
+        of, start, p = self._unknowns, self._recent[0].before, self._unknowns.terms
+        factor = start.noise_factor(of)
+        before, after = (
+            RigEvidence.total(of, [one.evidence for one in some])
+            for some in (self._recent[:first], self._recent[first:])
+        )
+        one = start.precision(of) + (before.information + after.information) / factor
+        mixed = after.information[:p] / factor
+        own = mixed[:, :p] + prior_information(of.rig)
+        joint = np.block([[own, mixed], [mixed.T, one]])
+        pull = np.append(after.pull[:p] / factor, start.pull + (before.pull + after.pull) / factor)
+        covariance = np.asarray(np.linalg.inv(joint))
+        return RigCorrection(of.rig, (covariance @ pull)[:p], covariance[:p, :p])
 
     # ----------------------------------------------------------------------------------------
 
     def remake(self) -> None:
-        """What is applied, of the filters that were put back."""
-        found = self._weighed()
-        applied = dataclasses.replace(found.applied, values=self._applied)
-        self.found = dataclasses.replace(found, applied=applied)
-
-    def _weighed(self) -> WeighedCorrection:
-        """As known now, under the field found so far."""
-        whole, early = self._whole.under(self.field_px), self._early.under(self.field_px)
-        return weighed(whole, early, (self._whole.prior, self._early.prior))
+        """What is applied, of the filter that was put back."""
+        self.found = self._known.weighed(self._unknowns).applying(self._applied)
 
     def _held(self, found: WeighedCorrection) -> WeighedCorrection:
-        """With the old correction where the new one is no farther from it than noise goes.
+        """With the old correction where the new one lies within a standard deviation of it.
 
-        The map was measured with the old one, and contradicts the new one.
+        Or while it is undecided whether the rig has moved.
         """
-        old = self.found.applied.values
+        old = self._applied
         change = found.applied.values - old
-        noise = found.applied.covariance
-        if change @ np.linalg.solve(noise, change) > self._early.free.sum():
-            return found
-        return dataclasses.replace(found, applied=dataclasses.replace(found.applied, values=old))
+        undecided = any(one.unlikely for one in self._recent)
+        if undecided or change @ np.linalg.solve(found.applied.covariance, change) <= 1.0:
+            return found.applying(old)
+        return found
 
 
 # --------------------------------------------------------------------------------------------
-# An information filter over the correction: the evidence of windows of a drive, added up.
+# An information filter over terms and nuisances together: the evidence of windows, added up.
 #
-# The noise of that evidence is estimated from how far it lies from what is known. Terms that the
-# filter does not free stay at zero, as uncertain as before the drive.
+# The noise of that evidence is estimated from how far it lies from what is known. What was known
+# before the drive stays apart, so that the size of the field can be learnt, and models can be
+# compared that hold some of the terms at zero.
 
 
 _KERNEL_FACTOR = {2: 0.61, 3: 0.49}
@@ -213,116 +246,127 @@ _KERNEL_FACTOR = {2: 0.61, 3: 0.49}
 Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 s / (c^2 d)]^2 with
 Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
 """
-_KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
+_KNOCK_PROBABILITY = 1e-6  # of a window, or of a knock, so far off by chance
+_KNOCK_PX = 0.5  # root mean square over the image; less is left to the drift
 _UNOBSERVED = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
+_SHAKE = 0.02 / 360.0
+"""Radians by which images move against each other from frame to frame, before a drive shows it."""
+_TRUSTED_MODES = 4.0  # how many modes the stated size of a field is worth, next to those observed
+_FIELD_STEPS = 10  # of a fixed point that is near after three
 
 
-class _Field(NamedTuple):
-    """Modes of a field (:mod:`fgslam.core.correction`) as the same windows show them.
+class RigUnknowns:
+    """The terms of a rig's correction, then its nuisances: what a drive shows together."""
 
-    Eliminated from what is known, they would need their prior at once; so they are kept next to it,
-    and the prior may change with what is found. docs/derivations/cameras.md.
+    def __init__(self, rig: CameraRig) -> None:
+        """Those of a rig."""
+        self.rig = rig
+        self.terms = len(term_names(rig))
+        """Number of terms, p."""
+        self.modes = field_modes(rig)
+        self._prior = block_diag(prior_information(rig), nuisance_information(rig, 1.0))
+        self.size = len(self._prior)
+        """Of terms and nuisances, n; the field's modes come last."""
 
-    Attributes:
-        lean: (p, q) how the correction known changes with the modes.
-        information: (q, q) of the modes, the correction being unknown.
-        score: (q,) where they would go.
-    """
+    def prior(self, field_px: float) -> FloatArray:
+        """(n, n) information before the drive, about zero."""
+        out: FloatArray = self._prior.copy()
+        out[-self.modes :, -self.modes :] /= field_px**2
+        return out
 
-    lean: FloatArray
-    information: FloatArray
-    score: FloatArray
+    def displacements(self, pixels: FloatArray) -> FloatArray:
+        """(k, 2 * cameras, n) of pixels (k, cameras, 2) by a unit of each."""
+        of_each = displacements(self.rig, pixels), nuisance_displacements(self.rig, pixels)
+        return np.concatenate(of_each, axis=2)
 
-    @staticmethod
-    def none(rig: CameraRig, terms: int) -> _Field:
-        """Before the drive."""
-        q = field_modes(rig)
-        return _Field(np.zeros((terms, q)), np.zeros((q, q)), np.zeros(q))
-
-    def after(self, evidence: RigEvidence, before: FloatArray, covariance: FloatArray) -> _Field:
-        """With a window of the noise that it states.
-
-        Args:
-            evidence: of the window.
-            before: (p,) the correction known before it.
-            covariance: (p, p) of the correction known after it.
-        """
-        off = evidence.at - before
-        score = evidence.score + evidence.information @ off
-        mixed = evidence.information @ self.lean + evidence.lean
-        gain = covariance @ mixed
-        own = self.lean.T @ mixed + evidence.lean.T @ self.lean + evidence.field
-        pull = evidence.pull + evidence.lean.T @ off + self.lean.T @ score
-        return _Field(
-            self.lean - gain,
-            self.information + own - mixed.T @ gain,
-            self.score + pull - gain.T @ score,
-        )
+    def models(self) -> dict[str, BoolArray]:
+        """Which of all (n,) are free, by name of the model; nuisances are in each."""
+        names = np.array([name.split(".")[-1] for name in term_names(self.rig)])
+        free = {model: np.isin(names, terms) for model, terms in MODELS.items()}
+        nuisances: BoolArray = np.ones(self.size - self.terms, np.bool_)
+        return {model: np.append(own, nuisances) for model, own in free.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFilter:
-    """What is known of a rig's correction, and how noisy the windows are that tell it.
+    """What is known of a rig, and how noisy the windows are that tell it.
 
     Attributes:
-        known: the correction so far, as if there were no field.
-        free: (p,) terms that windows inform; the others are held at zero.
-        prior: (p, p) information before the drive, about zero.
-        field: its modes, as unknowns of the same windows.
+        information: (n, n) of the windows on the unknowns, without what was known before.
+        pull: (n,) ``information @ best``, where the windows alone would go.
+        field_px: deviation of the field's modes.
         misfit: squared distances of windows from what was known, in their own deviations, added up.
         freedom: how many numbers that is of.
+        shaken: squared shifts of single frames' rows, added up, radians^2.
+        frames: how many frames that is of.
     """
 
-    known: Kept[RigCorrection]
-    free: BoolArray
-    prior: FloatArray
-    field: Kept[_Field]
-    misfit: Kept[float] = 0.0
-    freedom: Kept[float] = 0.0
+    information: FloatArray
+    pull: FloatArray
+    field_px: float = FIELD_PX
+    misfit: float = 0.0
+    freedom: float = 0.0
+    shaken: float = 0.0
+    frames: float = 0.0
 
     @staticmethod
-    def of(rig: CameraRig, free: BoolArray) -> RigFilter:
-        """Before the drive; terms that are held tell nothing of the free ones."""
-        prior = prior_information(rig, free=free)
-        covariance = np.asarray(np.linalg.inv(prior), np.float64)
-        none = dataclasses.replace(RigCorrection.none(rig), covariance=covariance)
-        return RigFilter(none, free, prior, _Field.none(rig, len(prior)))
+    def none(of: RigUnknowns) -> RigFilter:
+        """Before the drive."""
+        return RigFilter(np.zeros((of.size, of.size)), np.zeros(of.size))
+
+    def precision(self, of: RigUnknowns) -> FloatArray:
+        """(n, n) of what is known, with what was known before the drive."""
+        return self.information + of.prior(self.field_px)
+
+    def values(self, of: RigUnknowns) -> FloatArray:
+        """(n,) of all unknowns."""
+        return np.asarray(np.linalg.solve(self.precision(of), self.pull))
 
     @property
-    def information(self) -> FloatArray:
-        """(p, p) of what is known."""
-        return np.asarray(np.linalg.inv(self.known.covariance), np.float64)
+    def shake(self) -> float:
+        """Deviation of a single frame's shift, radians."""
+        stated = TRUSTED_WINDOWS * WINDOW
+        return float(np.sqrt((stated * _SHAKE**2 + self.shaken) / (stated + self.frames)))
 
-    @property
-    def noise_factor(self) -> float:
+    def noise_factor(self, of: RigUnknowns) -> float:
         """Variance of the windows' evidence, as multiple of what their pixels alone would give."""
-        stated = TRUSTED_WINDOWS * int(self.free.sum())
-        usual = _KERNEL_FACTOR[self.known.rig.cameras]
+        stated = TRUSTED_WINDOWS * of.terms
+        usual = _KERNEL_FACTOR[of.rig.cameras]
         return max((usual * stated + self.misfit) / (stated + self.freedom), 1e-3)
 
-    def grown(self, share: float) -> RigFilter:
-        """The same, less certain by a share of the prior's covariance."""
-        covariance = self.known.covariance + share * np.linalg.inv(self.prior)
-        return dataclasses.replace(
-            self, known=dataclasses.replace(self.known, covariance=covariance)
-        )
+    def faded(self, share: float) -> RigFilter:
+        """The same, after a share of the time in which it is forgotten."""
+        left = float(np.exp(-share))
+        return dataclasses.replace(self, information=left * self.information, pull=left * self.pull)
 
-    def judged(self, evidence: RigEvidence) -> tuple[bool, RigFilter]:
+    def without_terms(self, of: RigUnknowns) -> RigFilter:
+        """The same of another rig in the same place: of the terms nothing is known."""
+        p = of.terms
+        known = self.information[:p, :p] + of.prior(self.field_px)[:p, :p]
+        gain = np.linalg.solve(known, np.column_stack([self.information[:p, p:], self.pull[:p]]))
+        information, pull = np.zeros_like(self.information), np.zeros_like(self.pull)
+        mixed = self.information[p:, :p]
+        information[p:, p:] = self.information[p:, p:] - mixed @ gain[:, :-1]
+        pull[p:] = self.pull[p:] - mixed @ gain[:, -1]
+        return dataclasses.replace(self, information=information, pull=pull)
+
+    def judged(self, of: RigUnknowns, evidence: RigEvidence) -> tuple[bool, RigFilter]:
         """Whether what is known cannot explain a window; and the filter that knows its noise.
 
         Judged in the window's own principal directions, those in which it has evidence: how far
         it lies from what is known, in units of its own noise and of what is known.
         """
+        prior, factor = of.prior(self.field_px), self.noise_factor(of)
+        covariance = np.linalg.inv(self.information + prior)
         size, axes = np.linalg.eigh(evidence.information)
-        score = evidence.score + evidence.information @ (evidence.at - self.known.values)
-        telling = size > _UNOBSERVED * np.diagonal(axes.T @ self.prior @ axes)
+        score = evidence.pull - evidence.information @ (covariance @ self.pull)
+        telling = size > _UNOBSERVED * np.diagonal(axes.T @ prior @ axes)
         score = (axes.T @ score)[telling] / np.sqrt(size[telling])
         root = axes[:, telling] * np.sqrt(size[telling])
-        known = root.T @ self.known.covariance @ root / self.noise_factor
-        known_share, turn = np.linalg.eigh(known)
+        known_share, turn = np.linalg.eigh(root.T @ covariance @ root / factor)
         squared = (turn.T @ score) ** 2 / (1.0 + known_share)
         likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, len(score))
-        unlikely = bool(squared.sum() / self.noise_factor > likely)
+        unlikely = bool(squared.sum() / factor > likely)
         noisy = known_share < 1.0  # elsewhere it is the prior that is judged
         counted = dataclasses.replace(
             self,
@@ -331,38 +375,50 @@ class RigFilter:
         )
         return unlikely, counted
 
-    def after(self, evidence: RigEvidence) -> RigFilter:
-        """With the evidence of a window."""
-        factor, added = self.noise_factor, evidence.information
-        score = evidence.score + added @ (evidence.at - self.known.values)
-        covariance = np.asarray(np.linalg.inv(self.information + added / factor), np.float64)
-        covariance = (covariance + covariance.T) / 2.0
-        values = self.known.values + covariance @ (score / factor)
-        known = dataclasses.replace(self.known, values=values, covariance=covariance)
-        field = self.field.after(evidence.over(factor), self.known.values, covariance)
-        return dataclasses.replace(self, known=known, field=field)
-
-    def under(self, field_px: float) -> RigCorrection:
-        """What is known where a field of this standard deviation is not; pixels, 0: there is none.
-
-        Its modes are unknowns that all windows share, with that prior, and are eliminated.
-        """
-        if field_px == 0.0:
-            return self.known
-        known, lean, information, score = self.known, *self.field
-        modes = np.linalg.inv(information + np.eye(len(score)) / field_px**2)
-        return dataclasses.replace(
-            known,
-            values=known.values + lean @ (modes @ score),
-            covariance=known.covariance + lean @ modes @ lean.T,
+    def after(self, of: RigUnknowns, evidence: RigEvidence) -> RigFilter:
+        """With the evidence of a window, and the size of the field as known then."""
+        factor = self.noise_factor(of)
+        added = dataclasses.replace(
+            self,
+            information=self.information + evidence.information / factor,
+            pull=self.pull + evidence.pull / factor,
+            shaken=self.shaken + evidence.shaken,
+            frames=self.frames + evidence.frames,
         )
+        return dataclasses.replace(added, field_px=added._size_of_field(of))
 
-    def evidence_of(
-        self, rig: CameraRig, frames: Sequence[tuple[FloatArray, Observations]], sigma_px: float
-    ) -> RigEvidence | None:
-        """Of a window (wTc, what the ego-motion accepted) on the free terms; None without any."""
-        alignment = RigAlignment(rig, frames, sigma_px, self.free)
-        return alignment.evidence(self.known.values, self.information)
+    def _size_of_field(self, of: RigUnknowns) -> float:
+        """Deviation of the modes under which the windows are likeliest (MacKay 2003, ch. 28)."""
+        variance = FIELD_PX**2
+        for _ in range(_FIELD_STEPS):
+            covariance = np.linalg.inv(self.information + of.prior(np.sqrt(variance)))
+            modes = (covariance @ self.pull)[-of.modes :]
+            shown = of.modes - np.diagonal(covariance)[-of.modes :].sum() / variance
+            found = _TRUSTED_MODES * FIELD_PX**2 + modes @ modes
+            variance = float(found / (_TRUSTED_MODES + shown))
+        return float(np.sqrt(variance))
+
+    def weighed(self, of: RigUnknowns) -> WeighedCorrection:
+        """The correction and its mean over models, by their evidence; nuisances are free in all."""
+        p, prior, precision = of.terms, of.prior(self.field_px), self.precision(of)
+        covariance = np.asarray(np.linalg.inv(precision))
+        values = covariance @ self.pull
+        means, evidence = [], []
+        for free in of.models().values():
+            inner = np.ix_(free, free)
+            mean = np.zeros(of.size)
+            mean[free] = np.linalg.solve(precision[inner], self.pull[free])
+            gain = np.linalg.slogdet(precision[inner])[1] - np.linalg.slogdet(prior[inner])[1]
+            means.append(mean[:p])
+            evidence.append(0.5 * (self.pull @ mean - gain))
+        weight = np.exp(np.array(evidence) - max(evidence))
+        weight /= weight.sum()
+        known = RigCorrection(of.rig, values[:p], covariance[:p, :p], self.field_px)
+        return WeighedCorrection(
+            known,
+            dataclasses.replace(known, values=weight @ np.array(means)),
+            dict(zip(of.models(), weight.tolist(), strict=True)),
+        )
 
 
 # --------------------------------------------------------------------------------------------
@@ -373,97 +429,44 @@ class RigFilter:
 # equally likely before the drive. An exact rig is thereby left alone, without a threshold.
 
 
-MODELS: dict[str, frozenset[str]] = {
-    "exact": frozenset(),
-    "bent": frozenset({"yaw", "pitch"}),
-    "turned": frozenset({"yaw", "pitch", "roll", "focal"}),
+MODELS: dict[str, tuple[str, ...]] = {
+    "exact": (),
+    "displaced": BASELINE_TERMS,
+    "bent": ("yaw", "pitch"),
+    "turned": ("yaw", "pitch", "roll", "focal"),
+    "whole": TERMS,
 }
-"""Terms of the other cameras that are free, by name of the model; in `lens` all early ones are
-(:func:`fgslam.core.correction.early_terms`), in `whole` every term is."""
+"""Terms of the cameras that are free, by name of the model."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class WeighedCorrection:
     """An estimate, and what of it is worth applying.
 
     Attributes:
         estimated: with all terms free; its sigmas are the honest ones.
-        applied: what is taken off the next frames: the mean over models of the early terms, or an
-            older one that lies within the noise of it.
-        settled: what the frames so far are best corrected by, all alike: the mean over all models.
-            None where `whole` is not the likeliest: then each frame's own is no worse.
+        applied: what is taken off the next frames: the mean over models, or an older one that lies
+            within the noise of it.
         probabilities: of each model.
     """
 
     estimated: RigCorrection
     applied: RigCorrection
-    settled: RigCorrection | None
     probabilities: dict[str, float]
 
-    @property
-    def best(self) -> RigCorrection:
-        """The one settled, else the one applied."""
-        return self.applied if self.settled is None else self.settled
-
-
-def weighed(
-    estimated: RigCorrection, early: RigCorrection, priors: tuple[FloatArray, FloatArray]
-) -> WeighedCorrection:
-    """Both estimates averaged over models.
-
-    Args:
-        estimated: with all terms free.
-        early: with the early ones free, the others held at zero.
-        priors: (p, p) information of each before the drive, about zero.
-    """
-    models = _free_terms(estimated)
-    names = list(models)
-    applied, _ = _mean(early, [models[name] for name in names[:-1]], priors[1])
-    settled, shares = _mean(estimated, list(models.values()), priors[0])
-    whole = bool(shares.argmax() == len(shares) - 1)
-    return WeighedCorrection(
-        estimated,
-        applied,
-        settled if whole else None,
-        dict(zip(names, shares.tolist(), strict=True)),
-    )
-
-
-def _mean(
-    known: RigCorrection, models: list[BoolArray], prior: FloatArray
-) -> tuple[RigCorrection, FloatArray]:
-    """The mean over models, by which terms (p,) each frees, and their probabilities (n,)."""
-    information = np.linalg.inv(known.covariance)
-    pull = information @ known.values
-    means, evidence = [], []
-    for free in models:
-        inner = np.ix_(free, free)
-        mean = np.zeros(len(pull))
-        mean[free] = np.linalg.solve(information[inner], pull[free])
-        gain = np.linalg.slogdet(information[inner])[1] - np.linalg.slogdet(prior[inner])[1]
-        means.append(mean)
-        evidence.append(0.5 * (pull @ mean - gain))
-    weight = np.exp(np.array(evidence) - max(evidence))
-    weight /= weight.sum()
-    return dataclasses.replace(known, values=weight @ np.array(means)), weight
-
-
-def _free_terms(correction: RigCorrection) -> dict[str, BoolArray]:
-    """Which values (p,) are free, by name of the model."""
-    names, early = term_names(correction.rig), early_terms(correction.rig)
-    out = {
-        model: early & np.array([name.split(".")[-1] in terms for name in names], np.bool_)
-        for model, terms in MODELS.items()
-    }
-    return out | {"lens": early, "whole": np.ones(len(names), np.bool_)}
+    def applying(self, values: FloatArray) -> WeighedCorrection:
+        """The same with another correction applied (p,)."""
+        applied = dataclasses.replace(self.applied, values=values)
+        return dataclasses.replace(self, applied=applied)
 
 
 # --------------------------------------------------------------------------------------------
-# The evidence of a few frames: their poses and points are eliminated.
+# The evidence of a few frames: their poses, shakes and points are eliminated.
 #
 # Bundle adjustment of one short window with errors in all images at both ends of every track. The
-# residuals are linear in the correction; poses and points are minimised over, then eliminated by
-# Schur complements (Triggs et al. 2000, Bundle adjustment, 6.1).
+# residuals are linear in the unknowns of the rig; poses and points are minimised over, and by how
+# much each frame's images are shifted against each other; then these are eliminated by Schur
+# complements (Triggs et al. 2000, Bundle adjustment, 6.1).
 
 
 _KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motion's
@@ -475,41 +478,43 @@ _NEAREST_M = 1e-2
 _LEAST_DISPARITY_PX = 0.5
 
 
+_SHAKEN = [TERMS.index(name) for name in ("column", "row", "roll", "focal")]
+"""Of each other camera, from frame to frame; the second one's size is learnt, and is all of theirs:
+rows show it without motion."""
+_ROW = 1
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigEvidence:
-    """Quadratic cost of a correction: half its Hessian and gradient at ``at``.
+    """Quadratic cost of a rig's unknowns: half its Hessian, and minus half its gradient at zero.
 
     Attributes:
-        information: (p, p), poses and points eliminated.
-        score: (p,) ``information @ (best - at)``: where this window alone would go.
-        at: (p,) the correction at which both are taken.
-        landmarks: that were seen in two frames or more.
-        lean: (p, q) Hessian of the correction against the modes of a field
-            (:mod:`fgslam.core.correction`), which are zero at ``at``.
-        field: (q, q) Hessian of those.
-        pull: (q,) where they would go.
+        information: (n, n), poses, shakes and points eliminated.
+        pull: (n,) ``information @ best``, where this window alone would go.
+        shaken: squared shifts of the frames' rows, added up, as expected: radians^2.
+        frames: how many they are.
     """
 
     information: FloatArray
-    score: FloatArray
-    at: FloatArray
-    landmarks: int
-    lean: FloatArray
-    field: FloatArray
     pull: FloatArray
+    shaken: float
+    frames: int
 
-    def over(self, factor: float) -> RigEvidence:
-        """The same with a variance that is larger by a factor."""
-        scaled = ("information", "score", "lean", "field", "pull")
-        parts = {name: getattr(self, name) / factor for name in scaled}
-        return dataclasses.replace(self, **parts)
+    @staticmethod
+    def total(of: RigUnknowns, some: Sequence[RigEvidence]) -> RigEvidence:
+        """Of windows, together."""
+        information, pull = np.zeros((of.size, of.size)), np.zeros(of.size)
+        for one in some:
+            information, pull = information + one.information, pull + one.pull
+        return RigEvidence(information, pull, 0.0, 0)
 
 
 @dataclass(slots=True, eq=False)
 class _State:
     poses: FloatArray
+    shakes: FloatArray
     points: FloatArray
-    correction: FloatArray
+    rig: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -519,20 +524,20 @@ class _Prediction:
     Attributes:
         local: (m, 3) points in the cameras that see them.
         residual: (m, 2 * cameras) predicted less raw pixels, whitened: of one sigma, independent.
-        unit: (m, 2 * cameras, p) displacements of the predicted pixels.
-        exact: (m, cameras, 2) those pixels.
+        unit: (m, 2 * cameras, n) displacements of the predicted pixels.
+        shaken: (m, 2 * cameras, q) the same by a unit of each of their frame's shakes.
     """
 
     state: _State
     local: FloatArray
     residual: FloatArray
     unit: FloatArray
-    exact: FloatArray
+    shaken: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations with the points eliminated; poses 1.. first, then the correction."""
+    """Normal equations with the points eliminated: frames, but for the first pose; then the rig."""
 
     hessian: FloatArray
     gradient: FloatArray
@@ -541,37 +546,23 @@ class _Normal:
     point_gradient: FloatArray
 
 
-def _of_last(normal: _Normal, count: int) -> tuple[FloatArray, FloatArray]:
-    """Information and score of the last unknowns, poses eliminated. Raises LinAlgError."""
-    poses, mixed = normal.hessian[:-count, :-count], normal.hessian[:-count, -count:]
-    gain = np.linalg.solve(poses, np.column_stack([mixed, normal.gradient[:-count]]))
-    information = normal.hessian[-count:, -count:] - mixed.T @ gain[:, :-1]
-    score = -(normal.gradient[-count:] - mixed.T @ gain[:, -1])
-    return (information + information.T) / 2.0, score
-
-
-def _without_last(normal: _Normal, count: int) -> _Normal:
-    """The same with the last unknowns held where they are."""
-    kept = slice(None, len(normal.gradient) - count)
-    hessian, gradient = normal.hessian[kept, kept], normal.gradient[kept]
-    return dataclasses.replace(normal, hessian=hessian, gradient=gradient)
-
-
 class RigAlignment:
     """One window of frames: a list of observations, by landmark and then by frame."""
 
     def __init__(
         self,
-        rig: CameraRig,
+        of: RigUnknowns,
         frames: Sequence[tuple[FloatArray, Observations]],
         pixel_sigma: float,
-        free: BoolArray,
+        shake: float,
     ) -> None:
         """Frames are (wTc, what the ego-motion accepted), in order of time.
 
-        Of the correction's terms (p,) those that are not ``free`` are held at zero.
+        ``shake``: deviation of a frame's shifts, radians.
         """
-        self._rig, self._sigma, self._free = rig, pixel_sigma, free
+        self._of, self._rig, self._sigma, self._shake = of, of.rig, pixel_sigma, shake
+        rig = of.rig
+        self._shaken = [k * len(TERMS) + term for k in range(rig.cameras - 1) for term in _SHAKEN]
         self._last: _Prediction | None = None
         self._poses = np.array([wTc for wTc, _ in frames])
         ids = np.concatenate([seen.ids for _, seen in frames])
@@ -587,29 +578,36 @@ class RigAlignment:
         self._white = np.linalg.inv(np.linalg.cholesky(pixel_covariance(rig.cameras, rig.places)))
         self._fuse = rig_map(rig)
 
-    def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:
-        """The window's evidence on the correction; None where it shows too little.
+    def evidence(self, known: FloatArray, precision: FloatArray) -> RigEvidence | None:
+        """The window's evidence on the rig; None where it shows too little.
 
         Args:
-            correction: (p,) as known so far; the minimisation starts and is held there.
-            prior: (p, p) its information.
+            known: (n,) of the rig so far; the minimisation starts and is held there.
+            precision: (n, n) of that.
         """
-        state = self._start(correction)
+        state = self._start(known)
         if state is None:
             return None
-        state = self._minimise(state, correction, prior)
+        state = self._minimise(state, known, precision)
         if state is None:
             return None
-        p, modes = len(correction), field_modes(self._rig)
-        normal = self._with_field(state)
+        normal, n = self._normal(self._predicted(state)), len(known)
+        hessian, mixed = normal.hessian[:-n, :-n], normal.hessian[:-n, -n:]
+        whole = normal.hessian.copy()
+        whole[-n:, -n:] += precision
         try:
-            information, score = _of_last(_without_last(normal, modes), p)
-            joint, pull = _of_last(normal, p + modes)
+            gain = np.linalg.solve(hessian, np.column_stack([mixed, normal.gradient[:-n]]))
+            spread = np.linalg.inv(whole)
         except np.linalg.LinAlgError:
             return None
-        lean, field = joint[:p, p:], joint[p:, p:]
-        count = len(self._first)
-        return RigEvidence(information, score, state.correction, count, lean, field, pull[p:])
+        information = normal.hessian[-n:, -n:] - mixed.T @ gain[:, :-1]
+        information = (information + information.T) / 2.0
+        score = -(normal.gradient[-n:] - mixed.T @ gain[:, -1])
+        pull = score + information @ state.rig
+        rows = np.arange(6 + _ROW, state.shakes.shape[1] + 6, len(_SHAKEN))
+        at = (6 + state.shakes.shape[1]) * np.arange(len(self._poses))[:, None] + rows
+        shifts = state.shakes[:, rows - 6] ** 2 + np.diagonal(spread)[at - 6]
+        return RigEvidence(information, pull, float(shifts.sum()), shifts.size)
 
     # ----------------------------------------------------------------------------------------
 
@@ -622,26 +620,27 @@ class RigAlignment:
         self._frame, self._pixels = self._frame[which][often], self._pixels[which][often]
         self._first = np.flatnonzero(np.diff(self._landmark, prepend=-1))
 
-    def _start(self, correction: FloatArray) -> _State | None:
+    def _start(self, rig: FloatArray) -> _State | None:
         """Points from their first sighting; landmarks that fit none of it are left out."""
-        self._keep(self._measured(correction)[:, 2] > _LEAST_DISPARITY_PX)
+        self._keep(self._measured(rig)[:, 2] > _LEAST_DISPARITY_PX)
         if not self._first.size:
             return None
-        local = triangulate(self._rig, self._measured(correction)[self._first])
+        local = triangulate(self._rig, self._measured(rig)[self._first])
         turn, place = self._poses[:, :3, :3], self._poses[:, :3, 3]
         at = self._frame[self._first]
         points = np.einsum("lij,lj->li", turn[at], local) + place[at]
-        found = self._predicted(_State(self._poses, points, correction))
+        still = np.zeros((len(self._poses), len(self._shaken)))
+        found = self._predicted(_State(self._poses, still, points, rig))
         wild = (np.abs(found.residual).max(axis=1) > _GROSS) | (found.local[:, 2] < _NEAREST_M)
         usable = ~np.logical_or.reduceat(wild, self._first)
         self._keep(usable[self._landmark])
-        if usable.sum() < len(correction):
+        if usable.sum() < self._of.terms:
             return None
-        return _State(self._poses, points[usable], correction)
+        return _State(self._poses, still, points[usable], rig)
 
-    def _measured(self, correction: FloatArray) -> FloatArray:
+    def _measured(self, rig: FloatArray) -> FloatArray:
         """(column, row, disparity) (m, 3), corrected."""
-        moved = displacements(self._rig, self._pixels) @ correction
+        moved = self._of.displacements(self._pixels) @ rig
         return np.asarray((self._raw() - moved) @ self._fuse.T)
 
     def _raw(self) -> FloatArray:
@@ -665,20 +664,21 @@ class RigAlignment:
         safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
         exact = project(self._rig, safe) @ self._model.T
         pixels = exact.reshape(-1, self._rig.cameras, 2)
-        unit = displacements(self._rig, pixels)
-        unit *= self._free
-        off = exact + unit @ state.correction - self._raw()
-        residual = off @ self._white.T / self._sigma
-        self._last = _Prediction(state, local, residual, unit, pixels)
+        unit = self._of.displacements(pixels)
+        shaken = unit[:, :, self._shaken]
+        moved = unit @ state.rig + (shaken @ state.shakes[self._frame, :, None])[..., 0]
+        residual = (exact + moved - self._raw()) @ self._white.T / self._sigma
+        self._last = _Prediction(state, local, residual, unit, shaken)
         return self._last
 
     def _cost(self, state: _State, around: FloatArray, prior: FloatArray) -> float:
         found = self._predicted(state)
         if (found.local[:, 2] < _NEAREST_M).any():
             return np.inf
-        off = state.correction - around
+        off = state.rig - around
         squared = (found.residual**2).sum(axis=1) / _KERNEL_WIDTH**2
-        return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + off @ prior @ off)
+        shaken = float((state.shakes**2).sum()) / self._shake**2
+        return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + shaken + off @ prior @ off)
 
     def _minimise(self, state: _State, around: FloatArray, prior: FloatArray) -> _State | None:
         damping, best = 1e-6, self._cost(state, around, prior)
@@ -697,26 +697,17 @@ class RigAlignment:
                 break
         return state
 
-    def _with_field(self, state: _State) -> _Normal:
-        """Normal equations with the modes of a field as further unknowns, at zero."""
-        found = self._predicted(state)
-        modes = field_displacements(self._rig, found.exact)
-        unit = np.concatenate([found.unit, modes], axis=2)
-        return self._normal(dataclasses.replace(found, unit=unit))
-
     def _normal(self, found: _Prediction) -> _Normal:
-        state = found.state
-        local, residual, unit = found.local, found.residual, self._white @ found.unit
+        state, local, residual = found.state, found.local, found.residual
         squared = (residual**2).sum(axis=1)
-        root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))
-        by_local = root[:, None, None] * (
-            self._white @ self._model @ projection_jacobian(self._rig, local)
-        )
+        root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))[:, None, None]
+        by_local = root * (self._white @ self._model @ projection_jacobian(self._rig, local))
         by_pose = by_local @ point_pose_jacobian(local)
         by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
-        joint = np.concatenate([by_pose, root[:, None, None] * unit], axis=2)
-        weighted = self._sigma * root[:, None] * residual
-        hessian, gradient = self._of_frames(joint, weighted)
+        of_pixels = root * (self._white @ np.concatenate([found.shaken, found.unit], axis=2))
+        joint = np.concatenate([by_pose, of_pixels], axis=2)
+        weighted = self._sigma * root[..., 0] * residual
+        hessian, gradient = self._of_frames(state, joint, weighted)
         point_left = np.swapaxes(by_point, 1, 2)
         curvature = np.add.reduceat(point_left @ by_point, self._first)
         curvature += 1e-9 * np.trace(curvature, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -729,31 +720,31 @@ class RigAlignment:
         gradient = gradient - np.einsum("lnj,lj->n", eliminated, pull)
         return _Normal(hessian, gradient, inverse, coupling, pull)
 
-    def _of_frames(self, joint: FloatArray, weighted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _of_frames(
+        self, state: _State, joint: FloatArray, weighted: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Joint Hessian and gradient before points are eliminated; the first pose is held."""
-        frames, p = len(self._poses), joint.shape[2] - 6
-        size = 6 * (frames - 1)
-        hessian, out = np.zeros((size + p, size + p)), np.zeros(size + p)
+        frames, own = len(self._poses), 6 + len(self._shaken)
+        size, rig = frames * own, frames * own + np.arange(self._of.size)
+        hessian, out = np.zeros((size + len(rig),) * 2), np.zeros(size + len(rig))
         for k in range(frames):
-            own = self._frame == k
-            jacobian = joint[own].reshape(-1, 6 + p)
-            block, gradient = jacobian.T @ jacobian, jacobian.T @ weighted[own].ravel()
-            hessian[size:, size:] += block[6:, 6:]
-            out[size:] += gradient[6:]
-            if k:
-                at = slice(6 * k - 6, 6 * k)
-                hessian[at, at], out[at] = block[:6, :6], gradient[:6]
-                hessian[at, size:], hessian[size:, at] = block[:6, 6:], block[6:, :6]
-        return hessian, out
+            at = np.append(np.arange(k * own, k * own + own), rig)
+            seen = self._frame == k
+            jacobian = joint[seen].reshape(-1, len(at))
+            hessian[np.ix_(at, at)] += jacobian.T @ jacobian
+            out[at] += jacobian.T @ weighted[seen].ravel()
+            shakes = at[6:own]
+            hessian[shakes, shakes] += 1.0 / self._shake**2
+            out[shakes] += state.shakes[k] / self._shake**2
+        return hessian[6:, 6:], out[6:]
 
     def _coupling(self, crossing: FloatArray) -> FloatArray:
-        """Points against poses 1.. and correction (l, n, 3), from observations (m, 6 + p, 3)."""
-        landmarks, later = len(self._first), len(self._poses) - 1
-        poses = np.zeros((landmarks, later, 6, 3))
-        moving = self._frame > 0
-        poses[self._landmark[moving], self._frame[moving] - 1] = crossing[moving, :6]
-        rig = np.add.reduceat(crossing[:, 6:], self._first)
-        return np.concatenate([poses.reshape(landmarks, 6 * later, 3), rig], axis=1)
+        """Points against frames and rig (l, n, 3), from observations (m, q + n, 3)."""
+        landmarks, frames, own = len(self._first), len(self._poses), 6 + len(self._shaken)
+        of_frames = np.zeros((landmarks, frames, own, 3))
+        of_frames[self._landmark, self._frame] = crossing[:, :own]
+        rig = np.add.reduceat(crossing[:, own:], self._first)
+        return np.concatenate([of_frames.reshape(landmarks, -1, 3)[:, 6:], rig], axis=1)
 
     def _step(
         self, state: _State, normal: _Normal, around: FloatArray, prior: FloatArray, damping: float
@@ -761,7 +752,7 @@ class RigAlignment:
         p = len(around)
         hessian, gradient = normal.hessian.copy(), normal.gradient.copy()
         hessian[-p:, -p:] += prior
-        gradient[-p:] += prior @ (state.correction - around)
+        gradient[-p:] += prior @ (state.rig - around)
         hessian.flat[:: len(hessian) + 1] *= 1.0 + damping
         try:
             step = np.asarray(-np.linalg.solve(hessian, gradient), np.float64)
@@ -769,118 +760,9 @@ class RigAlignment:
             return None
         pull = normal.point_gradient + np.einsum("lnj,n->lj", normal.coupling, step)
         points = state.points - np.einsum("lij,lj->li", normal.point_inverse, pull)
-        moves = step[:-p].reshape(-1, 6)
-        poses = np.stack(
-            [state.poses[0]]
-            + [moved_apart(T, xi) for T, xi in zip(state.poses[1:], moves, strict=True)]
-        )
-        return _State(poses, points, state.correction + step[-p:])
-
-
-# --------------------------------------------------------------------------------------------
-# How large a field of displacements the images show against each other.
-#
-# What a point's images contradict each other by (a pair: its rows) is seen in every frame, without
-# motion or truth. What of it depends on the place in the image, and is none of the terms of the
-# correction, is the field; its columns are taken to be as large. Landmarks are put into groups, and
-# only what different groups agree on counts, so that noise does not, were it a landmark's own for
-# good. docs/derivations/measurements.md.
-
-
-_GROUPS = 8  # of landmarks; a deviation from them is known to a quarter
-_LEAST_GROUPS = 4
-_TOGETHER = 64  # identities, given one after the other: neighbours share the noise of their texture
-_EVERY = 6  # frames between two estimates
-_FREE_PX = 100.0  # prior of the terms, so wide that none of them is left to the modes
-_SURE = 2.0  # standard errors above zero from which a field is one
-
-
-class FieldSize:
-    """Normal equations of rig terms and field, by group of landmarks; and the field's size."""
-
-    _normal: Kept[FloatArray]
-    _rows: Kept[IntArray]
-    _frames: Kept[int]
-    px: Kept[float]
-
-    def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
-        """Nothing seen yet; ``pixel_sigma`` of one coordinate, pixels."""
-        self._rig = rig
-        self._contradicting = null_space(
-            pixel_model(rig.cameras, vertical_to_horizontal(rig)).T
-        )  # (2 * cameras, 2 * cameras - 3) pixels that no point has
-        self._prior = pixel_sigma**2 * prior_information(rig, _FREE_PX)
-        size = len(self._prior) + field_modes(rig) + 1
-        self._normal = np.zeros((_GROUPS, size, size))
-        self._rows = np.zeros(_GROUPS, np.int64)
-        self._frames = 0
-        self.px = 0.0
-        """Standard deviation of one coordinate in each image, pixels; 0: none is seen."""
-
-    def observe(self, seen: Observations) -> None:
-        """Takes in what a frame's pose accepted."""
-        pixels = seen.pixels[:, : self._rig.cameras]
-        whole = np.asarray(np.isfinite(pixels).all(axis=(1, 2)), np.bool_)
-        if whole.any():
-            self._add(seen.select(whole))
-        self._frames += 1
-        if self._frames % _EVERY == 0:
-            variance, error = self._variance()
-            self.px = float(np.sqrt(variance)) if variance > _SURE * error else 0.0
-
-    # ----------------------------------------------------------------------------------------
-
-    def _add(self, seen: Observations) -> None:
-        """At the predicted pixels, whose noise is not that of the contradiction.
-
-        The contradictions are raw. Less what was applied, which changes on the way, no one value
-        of the terms would follow them, and the rest would be taken for a field.
-        """
-        rig, exact = self._rig, pixels_of(self._rig, seen.measurement)
-        terms = displacements(rig, exact)
-        off = seen.pixels[:, : rig.cameras].reshape(len(seen), -1)
-        columns = np.concatenate([terms, field_displacements(rig, exact), off[..., None]], axis=2)
-        columns = self._contradicting.T @ columns
-        group = seen.ids // _TOGETHER % _GROUPS
-        for k in range(_GROUPS):
-            own = columns[group == k].reshape(-1, columns.shape[2])
-            self._normal[k] += own.T @ own
-            self._rows[k] += len(own)
-
-    def _variance(self) -> tuple[float, float]:
-        """The field's variance without bias, pixels^2, and its standard error.
-
-        Products of what different groups show of the modes, over what a field of variance one
-        would make of them; the error by leaving out group by group (jackknife).
-        """
-        normal = self._normal[self._rows > self._normal.shape[1]]
-        if len(normal) < _LEAST_GROUPS:
-            return 0.0, np.inf
-        information, pull = self._of_field(normal)
-        whole = information.sum(axis=0)
-        # Modes count by how they show, each as far as it stands out of the noise.
-        shrunk = np.linalg.inv(whole + np.eye(len(whole)))
-        weighed = shrunk @ whole @ shrunk
-        found, found_without = _sums_over_pairs(pull @ weighed @ pull.T)
-        by_group = weighed @ information
-        unit, unit_without = _sums_over_pairs(np.einsum("gij,hji->gh", by_group, information))
-        without = found_without / unit_without
-        spread = ((without - without.mean()) ** 2).sum() * (len(normal) - 1) / len(normal)
-        return found / unit, float(np.sqrt(spread))
-
-    def _of_field(self, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """By group, information (g, m, m) and gradient (g, m) of the modes, terms eliminated."""
-        p = len(self._prior)
-        gain = np.linalg.solve(normal[:, :p, :p] + self._prior, normal[:, :p, p:])
-        left = normal[:, p:, p:] - normal[:, p:, :p] @ gain
-        return left[:, :-1, :-1], left[:, :-1, -1]
-
-
-def _sums_over_pairs(products: FloatArray) -> tuple[float, FloatArray]:
-    """Products (g, g) summed over different groups; (g,) the same without each group in turn."""
-    off = products - np.diag(np.diagonal(products))
-    whole = float(off.sum())
-    return whole, np.asarray(whole - off.sum(axis=0) - off.sum(axis=1))
+        moves = np.append(np.zeros(6), step[:-p]).reshape(len(state.poses), -1)
+        poses = [moved_apart(T, xi[:6]) for T, xi in zip(state.poses, moves, strict=True)]
+        return _State(np.stack(poses), state.shakes + moves[:, 6:], points, state.rig + step[-p:])
 
 
 # --------------------------------------------------------------------------------------------
@@ -902,10 +784,12 @@ class RigChange:
         rig: the cameras.
         values: (p,) the new correction less the old one
             (:func:`fgslam.core.correction.term_names`).
+        since: first frame whose measurements change.
     """
 
     rig: CameraRig
     values: FloatArray
+    since: int = 0
 
     def measured(self, measurement: FloatArray) -> FloatArray:
         """Measurements (k, 3) (column, row, disparity) of all images, by the new correction."""
@@ -914,12 +798,10 @@ class RigChange:
         moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
         return np.asarray(measurement - moved @ rig_map(self.rig).T)
 
-    def moved(self, poses: FloatArray, positions: FloatArray) -> tuple[FloatArray, float]:
+    def moved(self, poses: FloatArray, positions: FloatArray) -> FloatArray:
         """Landmarks (k, 3) in the world, each measured again from a pose (k, 4, 4) that saw it.
 
-        Returns:
-            Where they are then, one that its pose does not see where it was; and by how many
-            pixels of disparity they were off, root mean square.
+        One that its pose does not see is where it was.
         """
         turn, place = poses[:, :3, :3], poses[:, :3, 3]
         local = np.einsum("kji,kj->ki", turn, positions - place)
@@ -931,53 +813,4 @@ class RigChange:
         seen &= after[:, 2] > _LEAST_SHARE * before[:, 2]
         again = triangulate(self.rig, np.where(seen[:, None], after, before))
         again = np.einsum("kij,kj->ki", turn, again) + place
-        off = (after - before)[seen, 2]
-        rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
-        return np.where(seen[:, None], again, positions), rms
-
-
-@dataclass(slots=True, eq=False)
-class KnownCorrections:
-    """Which correction the measurements of which frames contain, and what became known later.
-
-    Attributes:
-        begins: first frame of each segment with one correction and one rig, ascending.
-        applied: (p,) of each, the correction that its measurements contain.
-        knocks: of each, how often the rig was found to have moved before.
-        settled: after so many knocks, what was known last for all frames alike, if anything.
-        field_px: what no term follows, as known last.
-    """
-
-    begins: list[int] = field(default_factory=list)
-    applied: list[FloatArray] = field(default_factory=list)
-    knocks: list[int] = field(default_factory=list)
-    settled: dict[int, FloatArray | None] = field(default_factory=dict)
-    field_px: float = 0.0
-
-    def note(self, frame: int, increment: Increment) -> None:
-        """Takes in one more frame; one without a correction changes nothing."""
-        applied, known = increment.rig_correction, increment.settled_rig
-        if applied is None:
-            return
-        knocks = 0 if known is None else known.knocks
-        if known is not None:
-            self.settled[knocks] = known.values
-            self.field_px = known.field_px
-        if not (self.begins and knocks == self.knocks[-1] and (applied == self.applied[-1]).all()):
-            self.begins.append(frame)
-            self.applied.append(applied)
-            self.knocks.append(knocks)
-
-    def recalibrate(self, change: RigChange) -> None:
-        """All measurements so far were corrected by a change."""
-        self.applied = [then + change.values for then in self.applied]
-
-    def settle(self, rig: CameraRig, frames: IntArray, measurement: FloatArray) -> FloatArray:
-        """Measurements (k, 3) of frames (k,) by what was known last of the rig as it was then."""
-        out = measurement.copy()
-        segment = np.searchsorted(self.begins, frames, side="right") - 1
-        for k, (applied, knocks) in enumerate(zip(self.applied, self.knocks, strict=True)):
-            settled, rows = self.settled.get(knocks), segment == k
-            if settled is not None and rows.any():
-                out[rows] = RigChange(rig, settled - applied).measured(measurement[rows])
-        return out
+        return np.where(seen[:, None], again, positions)

@@ -29,7 +29,7 @@ from fgslam.cameras.trees import (
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
-from fgslam.core.correction import RigCorrection, term_names
+from fgslam.core.correction import RigCorrection, image_terms, term_names
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text, write_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse, is_rigid, pose
@@ -242,12 +242,13 @@ def stated_corrections(path: Path, tree: Tree) -> Mapping[str, float] | None:
 
 
 def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) -> FloatArray:
-    """(p,) values of a rig's terms by their names.
+    """(p,) values of a rig's terms by their names; zero for what no image can be corrected by.
 
     Raises:
         CalibrationError: one is no term of the rig, or is missing; ``source`` names the file.
     """
-    names = term_names(rig)
+    own = image_terms(rig)
+    names = np.array(term_names(rig))[own].tolist()
     known = {*names, *(name.replace("left.", "top.") for name in names)}
     unknown = sorted(set(values) - known)
     if unknown:
@@ -255,7 +256,9 @@ def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) 
             f"{source}: {CORRECTIONS} has {unknown[0]!r}, which is no term; known: "
             f"{', '.join(names)}"
         )
-    return np.array([number(Path(source), values, name) for name in names])
+    out = np.zeros(len(own))
+    out[own] = [number(Path(source), values, name) for name in names]
+    return out
 
 
 def write_corrected(
@@ -290,7 +293,9 @@ def write_corrected(
             raw = replace(raw, cameras=cameras)
         values = raw_values(raw)
     if found.any():
-        terms = term_names(rig)
-        values[CORRECTIONS] = dict(zip(terms, found.tolist(), strict=True))
-        values["correction_sigmas"] = dict(zip(terms, correction.sigmas.tolist(), strict=True))
+        own = image_terms(rig)
+        terms = np.array(term_names(rig))[own].tolist()
+        values[CORRECTIONS] = dict(zip(terms, found[own].tolist(), strict=True))
+        sigmas = correction.sigmas[own].tolist()
+        values["correction_sigmas"] = dict(zip(terms, sigmas, strict=True))
     write_text(path, json.dumps(values, indent=2) + "\n")

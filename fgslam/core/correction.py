@@ -23,7 +23,7 @@ from fgslam.core.types import Features
 # ------------------------------------------------------------------------------------------
 # What a stated calibration leaves uncorrected, as displacements of a rig's pixels
 
-TERMS = (
+IMAGE_TERMS = (
     "column",  # principal point
     "row",
     "yaw",  # rotation, radians
@@ -38,9 +38,12 @@ TERMS = (
 )
 """Of each camera but the reference, in units of the focal length."""
 
-_EARLY_TERMS = 9
-"""How many of TERMS are taken off a frame before it is matched. The others, and COMMON, take a
-drive to be distinguished from its motion: whole graphs have them."""
+BASELINE_TERMS = ("baseline_across", "baseline_ahead")
+"""Direction in which the camera lies, radians from its baseline: in the image plane (left: down,
+top: right), and along the optical axis. What they displace a pixel by grows with its parallax."""
+
+TERMS = (*IMAGE_TERMS, *BASELINE_TERMS)
+"""Of each camera but the reference."""
 
 COMMON = ("radial",)
 """What is estimated of all cameras alike, the reference among them."""
@@ -53,6 +56,9 @@ them, as many drives show it less well than they seem to."""
 EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
 matcher's epipolar gate (``StereoSettings.epipolar_px``) admits; a worse rig matches nothing."""
+
+BASELINE_SIGMA = 7e-3
+"""Radians that a stated baseline's direction is off by: 0.2 to 0.4 degrees on KITTI's roads."""
 
 IMPLAUSIBLE_PX = 3.0 * EXPECTED_PX
 """Displacement that no calibration is taken to leave: three deviations of what is expected."""
@@ -71,10 +77,9 @@ def term_names(rig: CameraRig) -> tuple[str, ...]:
     return (*of_each, *(f"all.{term}" for term in COMMON))
 
 
-def early_terms(rig: CameraRig) -> BoolArray:
-    """Which values (p,) are taken off a frame before it is matched."""
-    own = np.tile(np.arange(len(TERMS)) < _EARLY_TERMS, rig.cameras - 1)
-    return np.concatenate([own, np.zeros(len(COMMON), np.bool_)])
+def image_terms(rig: CameraRig) -> BoolArray:
+    """Which values (p,) displace an image whatever it shows: all but the baselines' directions."""
+    return np.array([not name.endswith(BASELINE_TERMS) for name in term_names(rig)], np.bool_)
 
 
 def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
@@ -87,11 +92,28 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
     out = np.zeros((2 * rig.cameras, _count(rig), len(pixels)))
     for camera in range(rig.cameras):
         _fill(out[2 * camera : 2 * camera + 2], rig, camera, pixels[:, camera])
+    for camera in range(1, rig.cameras):
+        own = out[2 * camera : 2 * camera + 2, len(TERMS) * camera - 2 : len(TERMS) * camera]
+        own[:] = _by_direction(rig, camera, pixels[:, 0], pixels[:, camera])
     return np.ascontiguousarray(out.transpose(2, 0, 1))
 
 
+def _by_direction(
+    rig: CameraRig, camera: int, reference: FloatArray, own: FloatArray
+) -> FloatArray:
+    """Displacements (2, 2, k) of a camera's pixels (k, 2) by a unit of each of BASELINE_TERMS."""
+    along = camera - 1
+    parallax = (own - reference)[:, along]
+    across = np.zeros((2, len(own)))
+    across[1 - along] = -parallax
+    return np.stack([across, parallax * np.stack(_rays(rig, own))], axis=1)
+
+
 def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> FloatArray:
-    """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
+    """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term.
+
+    Zero for BASELINE_TERMS: what these do depends on where the reference camera sees the point.
+    """
     out = np.zeros((2, _count(rig), len(pixels)))
     _fill(out, rig, camera, pixels)
     return np.ascontiguousarray(out.transpose(2, 0, 1))
@@ -102,13 +124,13 @@ def _count(rig: CameraRig) -> int:
 
 
 def _fill(out: FloatArray, rig: CameraRig, camera: int, pixels: FloatArray) -> None:
-    """Writes one camera's displacements (2, p, k), which are zero but for its own and the common.
+    """Writes one camera's displacements (2, p, k) by its own IMAGE_TERMS and the common ones.
 
     Term by term over all pixels, for speed.
     """
     rays = _rays(rig, pixels)
     if camera:
-        own = slice(len(TERMS) * (camera - 1), len(TERMS) * camera)
+        own = slice(len(TERMS) * (camera - 1), len(TERMS) * camera - len(BASELINE_TERMS))
         _scale(out[:, own], rig, _terms(*rays))
         out[:, -len(COMMON) :] = out[:, own][:, _COMMON]
     else:
@@ -133,7 +155,7 @@ def _radial(x: FloatArray, y: FloatArray) -> _Shift:
 
 
 def _terms(x: FloatArray, y: FloatArray) -> list[_Shift]:
-    """Displacements in column and row of normalised image points (k,), in the order of TERMS."""
+    """Displacements in column and row of normalised image points (k,), by IMAGE_TERMS in turn."""
     xx, xy, yy = x * x, x * y, y * y
     r2, across = xx + yy, 2.0 * xy
     along_x, along_y, outer = r2 + 2.0 * xx, r2 + 2.0 * yy, across * r2
@@ -152,26 +174,55 @@ def _terms(x: FloatArray, y: FloatArray) -> list[_Shift]:
     ]
 
 
-def prior_information(
-    rig: CameraRig, expected_px: float = EXPECTED_PX, free: BoolArray | None = None
-) -> FloatArray:
+def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> FloatArray:
     """Information (p, p) of a calibration taken to leave ``expected_px`` over the image.
 
     As if a grid of displacements in every image had been measured as zero, with a noise for which
-    the displacements predicted by the terms have this standard deviation in the mean: by all of
-    them, or by the ``free`` (p,) ones alone and by the others alone.
+    the displacements predicted by the terms of images have this standard deviation in the mean.
     """
     unit = _grid_displacements(rig)
-    out = np.zeros((unit.shape[2], unit.shape[2]))
-    free = np.ones(len(out), np.bool_) if free is None else free
+    out = np.eye(unit.shape[2]) / BASELINE_SIGMA**2
     for k in range(rig.cameras):  # the reference camera's own are those of all
-        first = len(TERMS) * (k - 1)
-        group = np.arange(first, first + len(TERMS)) if k else len(out) - 1 - np.arange(len(COMMON))
-        for at in (group[free[group]], group[~free[group]]):
-            jacobian = unit[:, 2 * k : 2 * k + 2][..., at].reshape(2 * len(unit), len(at))
-            scale = len(at) / (len(jacobian) * expected_px**2)
-            out[np.ix_(at, at)] = scale * (jacobian.T @ jacobian)
+        own = len(TERMS) * (k - 1) + np.arange(len(IMAGE_TERMS))
+        at = own if k else len(out) - 1 - np.arange(len(COMMON))
+        out[np.ix_(at, at)] = _stated(unit[:, 2 * k : 2 * k + 2][..., at], expected_px)
     return out
+
+
+def _stated(unit: FloatArray, expected_px: float) -> FloatArray:
+    """Information (n, n) of terms that displace an image's grid (k, 2, n) by so much, in the mean.
+
+    ``expected_px`` is the root mean square of one coordinate.
+    """
+    jacobian = unit.reshape(-1, unit.shape[2])
+    scale = unit.shape[2] / (len(jacobian) * expected_px**2)
+    return np.asarray(scale * (jacobian.T @ jacobian))
+
+
+# What else windows of a drive show, and is not corrected: nuisances
+
+FIELD_PX = 0.1
+"""Displacement of one coordinate in each image that a lens model leaves, before a drive shows it:
+0.06 px on EuRoC's rectified images and KITTI's, 0.12 on EuRoC's raw ones."""
+
+_ALIKE = [SHARED.index(n) for n in SHARED if n not in (*COMMON, "baseline")]
+
+
+def nuisance_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
+    """Displacements (k, 2 * cameras, q) of pixels (k, cameras, 2) by a unit of each nuisance.
+
+    The terms that all cameras share, but those in COMMON; then the modes of a field, pixels.
+    """
+    shared = shared_displacements(rig, pixels)[..., _ALIKE]
+    return np.concatenate([shared, field_displacements(rig, pixels)], axis=2)
+
+
+def nuisance_information(rig: CameraRig, field_px: float = FIELD_PX) -> FloatArray:
+    """Information (q, q) about the nuisances before a drive."""
+    from scipy.linalg import block_diag  # light modules do not load SciPy
+
+    shared = _stated(shared_displacements(rig, _grid(rig))[:, :2][..., _ALIKE], EXPECTED_PX)
+    return np.asarray(block_diag(shared, np.eye(field_modes(rig)) / field_px**2))
 
 
 def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
@@ -181,7 +232,7 @@ def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
     """
     terms = _terms(*_rays(rig, pixels.reshape(-1, 2)))
     of_lens = np.zeros((2, len(SHARED), rig.cameras * len(pixels)))
-    _scale(of_lens, rig, [terms[TERMS.index(name)] for name in SHARED[:-1]])
+    _scale(of_lens, rig, [terms[IMAGE_TERMS.index(name)] for name in SHARED[:-1]])
     out = np.ascontiguousarray(of_lens.transpose(2, 0, 1))
     out = out.reshape(len(pixels), 2 * rig.cameras, len(SHARED))
     out[:, 2, -1] = pixels[:, 1, 0] - pixels[:, 0, 0]
@@ -195,11 +246,10 @@ def shared_information(rig: CameraRig, expected_px: float) -> FloatArray:
 
     The baseline is known as well as the focal length, relative: both come from the size of a board.
     """
-    jacobian = shared_displacements(rig, _grid(rig))[:, :2, :-1].reshape(-1, len(SHARED) - 1)
-    points = len(jacobian) // 2
-    scale = jacobian.shape[1] / (points * expected_px**2)
     out = np.zeros((len(SHARED), len(SHARED)))
-    out[:-1, :-1] = scale * (jacobian.T @ jacobian)
+    out[:-1, :-1] = _stated(
+        shared_displacements(rig, _grid(rig))[:, :2, :-1], expected_px / np.sqrt(2.0)
+    )
     focal = SHARED.index("focal")
     out[-1, -1] = 1.0 / np.linalg.inv(out[:-1, :-1])[focal, focal]
     return out
@@ -293,7 +343,10 @@ class RigCorrection(Brief):
         return float(self.values @ np.linalg.solve(self.covariance, self.values))
 
     def straightened(self, features: tuple[Features, ...]) -> tuple[Features, ...]:
-        """Features of right, left[, top] where an exact rig had found them."""
+        """Features of right, left[, top] where an exact rig had found them.
+
+        But for the baselines' directions: for these :meth:`by_direction`, when they are matched.
+        """
         if not self.values.any():
             return features
         moved = [
@@ -302,6 +355,15 @@ class RigCorrection(Brief):
         ]
         pairs = zip(features, moved, strict=True)
         return tuple(dataclasses.replace(found, xy=found.xy - off) for found, off in pairs)
+
+    def by_direction(self, camera: int, reference: FloatArray, own: FloatArray) -> FloatArray:
+        """Displacements (k, 2) of a camera's pixels (k, 2) whose partners are ``reference``."""
+        if not camera:
+            return np.zeros_like(own)
+        last = len(TERMS) * camera
+        unit = _by_direction(self.rig, camera, reference, own)
+        values = self.values[last - len(BASELINE_TERMS) : last]
+        return np.asarray(np.einsum("ank,n->ka", unit, values))
 
 
 _LENGTH = 0.25  # of the image's width: deviation of the Gaussian kernel by which places are alike
@@ -367,7 +429,7 @@ def _modes(rig: CameraRig) -> _Modes:
     places = np.stack([axis.ravel() for axis in np.meshgrid(across, down)], axis=1)
     apart = ((places[:, None] - places) ** 2).sum(axis=2)
     alike = np.kron(np.exp(-0.5 * apart / (_LENGTH * rig.width) ** 2), np.eye(2))
-    unit = camera_displacements(rig, 1, places)[..., : len(TERMS)]
+    unit = camera_displacements(rig, 1, places)[..., : len(IMAGE_TERMS)]
     terms = np.linalg.qr(unit.reshape(len(alike), -1))[0]
     rest = np.eye(len(alike)) - terms @ terms.T
     variances, axes = np.linalg.eigh(rest @ alike @ rest)

@@ -157,7 +157,7 @@ def _require_measured(log: MeasurementLog) -> None:
 LOG = FileKind(
     MeasurementLog,
     "fgslam measurement log",
-    version=8,
+    version=9,
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",

@@ -127,18 +127,17 @@ class LoopClosure(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SettledRig(Brief):
-    """What a rig that calibrates itself is known to be off by, for all frames alike.
+    """Since when a rig that calibrates itself is as it is now, and what its correction leaves.
 
     Attributes:
-        values: (p,) of the correction (:func:`fgslam.core.correction.term_names`); None where
-            each frame's own is no worse.
         knocks: how often the rig was found to have moved before.
+        since: first frame, from 0, of the rig as it is now.
         field_px: what no term of the correction follows, taken off nothing: standard deviation of
             one coordinate in each image (:mod:`fgslam.core.correction`).
     """
 
-    values: FloatArray | None
     knocks: int
+    since: int = 0
     field_px: float = 0.0
 
 
@@ -161,7 +160,7 @@ class Increment(Brief):
         rig_correction: (p,) of the rig against its calibration
             (:func:`fgslam.core.correction.term_names`), taken off the measurements already, not
             off the raw pixels; None where the calibration was taken as it is.
-        settled_rig: what was known then of the rig for all frames alike, taken off nothing; None
+        settled_rig: since when the rig is so, and what the correction leaves, as known then; None
             where the calibration was taken as it is.
     """
 
@@ -176,6 +175,11 @@ class Increment(Brief):
     relocalised: bool = False
     rig_correction: FloatArray | None = None
     settled_rig: SettledRig | None = None
+
+    @property
+    def rig_since(self) -> int:
+        """First frame, from 0, of the rig as it is in this one."""
+        return 0 if self.settled_rig is None else self.settled_rig.since
 
     @property
     def kept(self) -> Observations:

@@ -16,7 +16,13 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, Rows, chi_square_quantile, middle
-from fgslam.core.correction import IMPLAUSIBLE_PX, TERMS, camera_displacements, prior_information
+from fgslam.core.correction import (
+    IMAGE_TERMS,
+    IMPLAUSIBLE_PX,
+    TERMS,
+    camera_displacements,
+    prior_information,
+)
 from fgslam.core.geometry import KERNEL, cauchy_fit
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import Kept
@@ -88,7 +94,8 @@ class LagModel:
     def __init__(self, rig: CameraRig, camera: int) -> None:
         """``camera``: 1 left, 2 top."""
         self._rig, self._camera = rig, camera
-        self._own = slice(len(TERMS) * (camera - 1), len(TERMS) * camera)
+        first = len(TERMS) * (camera - 1)
+        self._own = slice(first, first + len(IMAGE_TERMS))
         self._prior = prior_information(rig)[self._own, self._own]
 
     @property
@@ -257,9 +264,9 @@ def _turn_of(
 ) -> tuple[FloatArray, FloatArray]:
     """Information (3, 3) and score (3,) of the turn; the lag of the frame is marginalised."""
     across = 1 if camera == 1 else 0
-    first = len(TERMS) * (camera - 1)
-    unit = camera_displacements(rig, camera, rows.place)[:, across, first : first + len(TERMS)]
-    design = np.column_stack([unit[:, _COLUMNS], rows.shift])
+    columns = [len(TERMS) * (camera - 1) + column for column in _COLUMNS]
+    unit = camera_displacements(rig, camera, rows.place)[:, across, columns]
+    design = np.column_stack([unit, rows.shift])
     prior = np.diag([_UNKNOWN_RAD**-2] * 3 + [_LAG_OF_TURN**-2])
     fit = cauchy_fit(design, rows.offset, prior, spread_px)
     information, score = fit.normal / fit.spread**2, fit.moment / fit.spread**2

@@ -64,7 +64,7 @@ class StereoMatcher:
         """
         straight = features if correction is None else correction.straightened(features)
         pairs = self.match_left(straight[0], straight[1])
-        return self._measure(features, straight, self._confirmed(straight, pairs))
+        return self._measure(features, straight, self._confirmed(straight, pairs), correction)
 
     def match_all(
         self, features: tuple[Features, ...], correction: RigCorrection | None = None
@@ -80,13 +80,15 @@ class StereoMatcher:
         straight = features if correction is None else correction.straightened(features)
         i, j = pairs = self.match_left(straight[0], straight[1])
         confirmed = self._confirmed(straight, pairs)
-        whole = self._measure(features, straight, confirmed)
+        whole = self._measure(features, straight, confirmed, correction)
         n, k = self._match_along(1, straight[0], straight[2], self._vertical_to_horizontal)
         # What both images show, but not at one depth, is contradicted and not seen twice.
         aside = np.isin(i, np.union1d(n, confirmed[0]), invert=True)
         above = np.isin(n, i, invert=True)
-        without_top = self._measure(features, straight, (i[aside], j[aside], None))
-        without_left = self._measure(features, straight, (n[above], None, k[above]))
+        matches = (i[aside], j[aside], None), (n[above], None, k[above])
+        without_top, without_left = (
+            self._measure(features, straight, one, correction) for one in matches
+        )
         every = whole.join(without_top).join(without_left)
         return dataclasses.replace(every, complete=np.arange(len(every)) < len(whole))
 
@@ -113,7 +115,7 @@ class StereoMatcher:
             good &= np.abs(vertical - horizontal) <= _DISPARITY_AGREEMENT_PX
         kept = np.flatnonzero(good)
         every = (kept,) * len(found)
-        return self._measure(found, straight, every, linear), np.asarray(good)
+        return self._measure(found, straight, every, correction, linear), np.asarray(good)
 
     def equally(self, share: float) -> Linear:
         """By images alike good; ``share``: a coordinate's sigma over that of SIFT's."""
@@ -185,6 +187,7 @@ class StereoMatcher:
         features: tuple[Features, ...],
         straight: tuple[Features, ...],
         matches: tuple[IntArray | None, ...],
+        correction: RigCorrection | None,
         linear: Linear | None = None,
     ) -> StereoFeatures:
         """Matched features (n,) of each camera, None for one that does not show them."""
@@ -194,6 +197,9 @@ class StereoMatcher:
         for camera, index in seen:
             pixels[:, camera] = features[camera].xy[index]
         used = [straight[camera].xy[index] for camera, index in seen]
+        if correction is not None:
+            pairs = zip(seen, used, strict=True)
+            used = [at - correction.by_direction(k, used[0], at) for (k, _), at in pairs]
         cameras = [camera for camera, _ in seen]
         if linear is None:
             linear = self._linear(cameras, len(features))

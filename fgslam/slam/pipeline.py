@@ -141,8 +141,9 @@ class SlamPipeline:
         self, timestamp: float, body: Odometry | None
     ) -> tuple[Odometry | None, Prediction]:
         """The camera's motion, and the pose after it, on the map that the calibration has moved."""
-        correction = self._correction()
-        recalibrated(self.estimator, None if correction is None else correction.values)
+        if self.calibration is not None:
+            correction = self.calibration.found.applied.values
+            recalibrated(self.estimator, correction, self.calibration.settled.since)
         odometry = self.motion.between(timestamp, body)
         return odometry, predicted(self.estimator, odometry)
 

@@ -165,7 +165,7 @@ def replay_frame(
         if increment.odometry is None or increment.odometry.turned:
             stand_in = motion.between(increment.timestamp, increment.odometry)
             increment = dataclasses.replace(increment, odometry=stand_in)
-        recalibrated(estimator, increment.rig_correction)
+        recalibrated(estimator, increment.rig_correction, increment.rig_since)
         prediction = predicted(estimator, increment.odometry)
     with watch.stage("track"):
         matched = increment.observations.select(~increment.observations.is_new)

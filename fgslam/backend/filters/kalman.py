@@ -37,7 +37,7 @@ from fgslam.backend.loops import (
     transported,
 )
 from fgslam.backend.protocol import recalibrated
-from fgslam.backend.self_calibration import SETTLING, RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import PerLandmarkSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.geometry import inverse, inverse_spd3
@@ -54,10 +54,6 @@ from fgslam.core.types import LAGS, EgoMotion, Estimate, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
-_CONTRADICTED = 2.0
-"""Sigmas of a measured disparity by which landmarks are off, rms, where a change of the rig's
-correction contradicts them: the width of the ego-motion's kernel."""
-
 
 class LandmarkKalman:
     """Estimator of kind ``landmark_kalman``, on :class:`fgslam.backend.protocol.Estimator`."""
@@ -72,7 +68,6 @@ class LandmarkKalman:
     _drive: Kept[DriveRecord]
     _errors: Kept[SampledErrors]
     _applied: Kept[FloatArray]
-    _disparity_sigma: Kept[float]
 
     def __init__(
         self,
@@ -102,7 +97,6 @@ class LandmarkKalman:
         self._errors = SampledErrors(solver, off=ego_motion is None)
         self._fixed = False
         self._applied = np.empty(0)  # correction of the rig in the last frame
-        self._disparity_sigma = np.inf  # of a measurement of the last frame that had any, pixels
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
@@ -118,7 +112,7 @@ class LandmarkKalman:
         closure, which is its uncertainty relative to the place returned to.
         """
         self._past.require_later(increment)
-        recalibrated(self, increment.rig_correction)
+        recalibrated(self, increment.rig_correction, increment.rig_since)
         step = self._step(increment, tracking)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
@@ -135,9 +129,6 @@ class LandmarkKalman:
         self._rows.remove(increment.pruned_ids)
         self._errors.forget(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
-        if len(increment.observations):
-            variances = increment.observations.covariance[:, 2, 2]
-            self._disparity_sigma = float(np.sqrt(np.median(variances)))
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         current = self._errors.pose(self._current)
         self._past.covariances[-1] = current.covariance
@@ -279,24 +270,19 @@ class LandmarkKalman:
             self._errors.forget(observed.ids)
             self._add(observed, len(self._past) - 1)
 
-    def recalibrate(self, correction: FloatArray) -> RigChange | None:
-        """Moves the landmarks of this drive where the change of the correction contradicts them.
+    def recalibrate(self, correction: FloatArray, since: int = 0) -> RigChange | None:
+        """Moves the landmarks of this drive that the rig has measured as it is since that frame.
 
         Returns:
-            By what they moved, None where they stay: a change within the noise of a measurement is
-            one more error among many, and after the first windows the rig itself may have moved.
+            By what they moved; None where the correction is what it was.
         """
         before, self._applied = self._applied, correction
-        known = np.flatnonzero(self._rows.homes >= 0)
-        early = 0 < len(self._past) < SETTLING
-        if not (early and before.size and len(known)):
+        if not before.size or not len(self._past) or (before == correction).all():
             return None
-        change = RigChange(self._rig, correction - before)
+        change = RigChange(self._rig, correction - before, since)
+        known = np.flatnonzero((self._rows.homes >= 0) & (self._rows.lasts >= since))
         poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
-        moved, off_px = change.moved(poses, self._rows.positions[known])
-        if not off_px > _CONTRADICTED * self._disparity_sigma:
-            return None
-        self._rows.positions[known] = moved
+        self._rows.positions[known] = change.moved(poses, self._rows.positions[known])
         return change
 
 

@@ -127,7 +127,8 @@ class LandmarkAdmission:
 
     def recalibrate(self, change: RigChange) -> None:
         """Corrects again what sightings measured; what contradicted may not any more."""
-        sightings = {id(s): s for t in self.tracks.values() for s in (t.last, *t.waiting)}
+        every = (s for t in self.tracks.values() for s in (t.last, *t.waiting))
+        sightings = {id(s): s for s in every if s.frame >= change.since}
         if not sightings:
             return
         measured = change.measured(np.array([s.measurement for s in sightings.values()]))

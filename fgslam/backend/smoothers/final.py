@@ -325,7 +325,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
 
 def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Without landmarks that come out behind a camera or that nothing supports."""
-    graph, state = builder.whole_graph(values, settled=True)
+    graph, state = builder.whole_graph(values)
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)

@@ -27,7 +27,7 @@ from fgslam.backend.loops import (
     refusal,
 )
 from fgslam.backend.persistence import Persistence, StatedNoise
-from fgslam.backend.self_calibration import KnownCorrections, RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
@@ -43,7 +43,7 @@ from fgslam.core.geometry import (
     transform_to_world,
     triangulate,
 )
-from fgslam.core.sensors import CameraRig, LoopClosure, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Increment, LoopClosure, Observations, Odometry
 from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 from fgslam.factors.landmark import StereoFactors, whitening
@@ -166,7 +166,7 @@ class GraphBuilder:
         self._prior = prior
         given = settings.noise_factor
         self.noise = Persistence(sensor) if given is None else StatedNoise(given)
-        self.corrections = KnownCorrections()
+        self._corrected: tuple[FloatArray, float] | None = None
         self._variance_of: dict[int, float] = {}
         self._turned: dict[int, TurnedStep] = {}
         self._weigh()
@@ -195,19 +195,27 @@ class GraphBuilder:
         return float(np.sqrt(self.noise.power / self.noise.spread))
 
     def recalibrate(self, change: RigChange) -> None:
-        """Corrects all observations so far again."""
-        self.observed["measurement"][:] = change.measured(self.observed["measurement"])
-        self.corrections.recalibrate(change)
+        """Corrects the observations of the frames that the change is of again."""
+        late = np.flatnonzero(self.observed["frame"] >= change.since)
+        measured = self.observed["measurement"]
+        measured[late] = change.measured(measured[late])
         self.admission.recalibrate(change)
+
+    def note(self, increment: Increment) -> None:
+        """Takes in what a frame was corrected by; one without a correction changes nothing."""
+        if increment.rig_correction is not None:
+            known = increment.settled_rig
+            field_px = 0.0 if known is None else known.field_px
+            self._corrected = increment.rig_correction, field_px
 
     @property
     def uncertain_rig(self) -> RigCorrection | None:
         """A rig that calibrates itself, with the correction applied last; None for a known one."""
-        applied = self.corrections.applied
-        if not applied:
+        if self._corrected is None:
             return None
-        none, px = RigCorrection.none(self._sensor), self.corrections.field_px
-        return dataclasses.replace(none, values=applied[-1], field_px=px)
+        values, field_px = self._corrected
+        none = RigCorrection.none(self._sensor)
+        return dataclasses.replace(none, values=values, field_px=field_px)
 
     @property
     def variables(self) -> int:
@@ -318,23 +326,16 @@ class GraphBuilder:
         return out
 
     def whole_graph(
-        self, values: Any, kernel: KernelSettings | None = None, settled: bool = False
+        self, values: Any, kernel: KernelSettings | None = None
     ) -> tuple[WholeGraph, State]:
-        """The same in arrays, at values of all variables; with another kernel where given.
-
-        With ``settled`` all measurements are corrected by what was known last of the rig.
-        """
-        graph, state = self._whole_graph(values, kernel or self.kernel, settled)
+        """The same in arrays, at values of all variables; with another kernel where given."""
+        graph, state = self._whole_graph(values, kernel or self.kernel)
         return graph.with_turns(list(self._turned.values()), state, self._persistence)
 
-    def _whole_graph(
-        self, values: Any, kernel: KernelSettings, settled: bool
-    ) -> tuple[WholeGraph, State]:
+    def _whole_graph(self, values: Any, kernel: KernelSettings) -> tuple[WholeGraph, State]:
         """Without turns of a gyroscope."""
         others = self._other_factors(turned=False)
         frames, variables, measured, covariances = self.kept_observed()
-        if settled:
-            measured = self.corrections.settle(self._sensor, frames, measured)
         return WholeGraph.of_rig(
             others,
             values,

@@ -21,7 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.self_calibration import KnownCorrections, RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.smoothers.bundle import Turn
 from fgslam.backend.smoothers.graph import Solution, TrackedFrame, allowed_parts
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -167,11 +167,6 @@ class Segments:
         self._block = [_corrected(frame, change) for frame in self._block]
         self.between = [_corrected(frame, change) for frame in self.between]
 
-    def settled(self, known: KnownCorrections) -> list[TrackedFrame]:
-        """Those between, by what was known last of a rig that calibrates itself."""
-        rig = self._sensor
-        return [_measured(frame, known.settle(rig, *_seen_in(frame))) for frame in self.between]
-
     def forget(self, identities: list[int]) -> None:
         """Landmarks that start again: what the open block saw of them is not the same landmark."""
         gone = np.array(identities, np.int64)
@@ -187,17 +182,9 @@ class Segments:
 
 
 def _corrected(frame: TrackedFrame, change: RigChange) -> TrackedFrame:
-    return _measured(frame, change.measured(frame.accepted.measurement))
-
-
-def _seen_in(frame: TrackedFrame) -> tuple[IntArray, FloatArray]:
-    """The frame's number (k,) and its measurements (k, 3)."""
-    measured = frame.accepted.measurement
-    return np.full(len(measured), frame.frame), measured
-
-
-def _measured(frame: TrackedFrame, measured: FloatArray) -> TrackedFrame:
-    """The frame with other measurements (k, 3)."""
+    if frame.frame < change.since:
+        return frame
+    measured = change.measured(frame.accepted.measurement)
     accepted = dataclasses.replace(frame.accepted, measurement=measured)
     return dataclasses.replace(frame, accepted=accepted)
 

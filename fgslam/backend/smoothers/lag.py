@@ -101,7 +101,7 @@ class FixedLagSolver:
 
     def recalibrate(self, change: RigChange) -> None:
         """Corrects the window's observations again; what has left it is what it was."""
-        self.window.remeasure(change.measured)
+        self.window.remeasure(change)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """The window's solution, in every frame."""
@@ -360,14 +360,14 @@ class SlidingWindowSolver(WholeGraphSolver):
         """Looks again at the window; what has left it moves with where it was seen last."""
         super().recalibrate(change)
         self._let_go()
-        self.window.remeasure(change.measured)
+        self.window.remeasure(change)
         self._take_in()  # the builder has corrected these already
         frames, variables, *_ = self.builder.kept_observed()
         if len(frames):
             last = np.zeros(len(self.held), np.int64)
             np.maximum.at(last, variables, frames)
             own, poses = ~self.held.saved, np.array(self.poses)[last]
-            self.held.points[own] = change.moved(poses[own], self.held.points[own])[0]
+            self.held.points[own] = change.moved(poses[own], self.held.points[own])
 
     # -- into the window and out of it -------------------------------------------------------
 

@@ -101,7 +101,7 @@ class Smoother:
             step = self._unknown_step(increment, tracking)
             increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
-        recalibrated(self, increment.rig_correction)
+        recalibrated(self, increment.rig_correction, increment.rig_since)
         before = self.tracker.predict(None).wTc
         # The tracker's covariances are given the graph's, and so are not uncertain themselves.
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
@@ -138,8 +138,7 @@ class Smoother:
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self.inputs.append(Input(increment, tracking))
-        frame = len(self.inputs) - 1
-        self.builder.corrections.note(frame, increment)
+        self.builder.note(increment)
         self._eras.append(self._takeovers)
         self._answer = None
 
@@ -287,7 +286,7 @@ class Smoother:
             if self._segments is not None:
                 tracks = self.builder.admission.tracks
                 variable_of = {i: track.variable for i, track in tracks.items()}
-                between = self._segments.settled(self.builder.corrections)
+                between = self._segments.between
                 motions = [one.increment.odometry for one in self.inputs]
                 self._answer = fill_between(
                     self._sensor, self._floor, self._answer, between, motions, variable_of
@@ -328,9 +327,9 @@ class Smoother:
         joint[:6, :6] = answer.pose_covariances[last]
         return joint
 
-    def recalibrate(self, correction: FloatArray) -> None:
-        """Where the tracker's map moves, corrects all that was measured so far again."""
-        change = self.tracker.recalibrate(correction)
+    def recalibrate(self, correction: FloatArray, since: int = 0) -> None:
+        """Where the tracker's map moves, corrects all that was measured since then again."""
+        change = self.tracker.recalibrate(correction, since)
         if change is None:
             return
         self._answer = None

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from fgslam.backend.loops import home_changes, rotated, transported
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.admission import LEAST_PARALLAX
 from fgslam.backend.smoothers.elimination import (
@@ -611,10 +612,12 @@ class Window:
         new = Observed(frame, variable, measurement, whitening(noise))
         self.observed = self.observed.join(new)
 
-    def remeasure(self, measured: Callable[[FloatArray], FloatArray]) -> None:
-        """Replaces the numbers (k, 3) of all observations by a function of them."""
-        again = measured(self.observed.measurement)
-        self.observed = dataclasses.replace(self.observed, measurement=again)
+    def remeasure(self, change: RigChange) -> None:
+        """Corrects the observations of the frames that the change is of."""
+        seen = self.observed
+        late = (seen.frame >= change.since)[:, None]
+        again = np.where(late, change.measured(seen.measurement), seen.measurement)
+        self.observed = dataclasses.replace(seen, measurement=again)
 
     # -- the solution ------------------------------------------------------------------------
 

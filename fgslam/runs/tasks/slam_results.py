@@ -16,7 +16,7 @@ from fgslam.backend.self_calibration import SelfCalibration
 from fgslam.cameras.calib_json import write_corrected
 from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.correction import IMPLAUSIBLE_PX, term_names
+from fgslam.core.correction import FIELD_PX, IMPLAUSIBLE_PX, term_names
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.files import make_subfolder, read_text, write_text
 from fgslam.core.geometry import inverse, transform_to_world
@@ -376,7 +376,7 @@ def alignment_slack(aligned: FloatArray, own: FloatArray) -> float:
 # What a run finds of its rig's calibration: calibration.csv, numbers, one sentence
 
 _SURE_SIGMAS = 3.0  # a change of fewer of its own sigmas is not reported
-_LEAST_FIELD_PX = 0.1  # of a field that is reported: recordings of good rigs show up to so much
+_LEAST_FIELD_PX = 2.0 * FIELD_PX  # of a field that is reported; less is expected of any lens
 _IMPLAUSIBLE = (
     ", more than calibrations leave: calibrate it again, unless something large that moved was "
     "taken for the scene"
@@ -397,7 +397,7 @@ def write_calibration(
     ``rectifier`` is what rectified the images; the file then is of the raw cameras. Raises
     OutputError.
     """
-    write_corrected(folder / CAMERA_FILE, calibration.found.best, rectifier)
+    write_corrected(folder / CAMERA_FILE, calibration.found.applied, rectifier)
     known = calibration.found.estimated
     terms = term_names(known.rig)
     changes = list(known.changes())
@@ -435,6 +435,7 @@ def calibration_numbers(calibration: SelfCalibration) -> dict[str, JsonValue]:
         "degrees_of_freedom": len(known.values),
         "displacement_rms_px": found.applied.rms_px(),
         "field_px": calibration.field_px,
+        "shake_px": calibration.shake_px,
         "changes": changes,
         "terms": terms,
     }

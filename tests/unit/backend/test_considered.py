@@ -480,7 +480,7 @@ def increments_of(
 ) -> list[Increment]:
     """The first frames of a drive, measured with a correction."""
     increments = drawn(3, frames=12).increments[:frames]
-    settled = SettledRig(None, 0, field_px)
+    settled = SettledRig(0, 0, field_px)
     return [
         dataclasses.replace(each, rig_correction=applied, settled_rig=settled)
         for each in increments

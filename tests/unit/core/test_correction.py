@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.correction import TERMS, displacements, field_displacements, field_modes
+from fgslam.core.correction import IMAGE_TERMS, displacements, field_displacements, field_modes
 from fgslam.core.sensors import CameraRig
 
 PAIR = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
@@ -26,7 +26,7 @@ def test_a_field_holds_nothing_that_terms_follow(rig: CameraRig) -> None:
     fields = field_displacements(rig, pixels)[:, 2:4]
     own = slice(field_modes(rig) // rig.cameras, 2 * field_modes(rig) // rig.cameras)
     fields = fields[..., own].reshape(2 * len(pixels), -1)
-    terms = displacements(rig, pixels)[:, 2:4, : len(TERMS)].reshape(len(fields), -1)
+    terms = displacements(rig, pixels)[:, 2:4, : len(IMAGE_TERMS)].reshape(len(fields), -1)
     left = fields - terms @ np.linalg.lstsq(terms, fields, rcond=None)[0]
     size = np.sqrt((fields**2).sum(axis=1).mean())
     assert 0.1 < size < 1.0

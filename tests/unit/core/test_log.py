@@ -133,10 +133,10 @@ TURN = Odometry.turn(np.eye(3), 1e-6 * np.eye(3), BIAS)
     "change",
     [
         {"odometry": TURN},
-        {"rig_correction": np.arange(float(TERMS)), "settled_rig": SettledRig(None, 0)},
+        {"rig_correction": np.arange(float(TERMS)), "settled_rig": SettledRig(0)},
         {
             "rig_correction": np.arange(float(TERMS)),
-            "settled_rig": SettledRig(np.arange(1.0, 1.0 + TERMS), 2, 0.3),
+            "settled_rig": SettledRig(2, 7, 0.3),
         },
     ],
 )
@@ -191,7 +191,7 @@ def turned(**change: Any) -> Callable[[Increment], Increment]:
         (turned(start_variance=0.0), "gyroscope: number 0 is no covariance"),
         (lambda step: replace(step, rejected=np.zeros(2, bool)), "differ in length"),
         (lambda step: replace(step, rig_correction=np.zeros(2)), "rig_correction has not"),
-        (lambda step: replace(step, settled_rig=SettledRig(None, 0, -1.0)), "field_px is -1.0"),
+        (lambda step: replace(step, settled_rig=SettledRig(0, 0, -1.0)), "field_px is -1.0"),
     ],
 )
 def test_values_that_no_run_measures_are_refused(
