@@ -71,6 +71,7 @@ class StereoRig(CameraRig):
         rectifier: how raw images become rectified ones; None where they are rectified already.
         sources: which of a calibration file's cameras are right, left[, top].
         remarks: what the calibration gives rise to say, a line each.
+        format: of the calibration's file, in words; empty where there is none.
 
     Raises:
         CalibrationError: a size, focal length or baseline is not positive and finite, the
@@ -83,6 +84,7 @@ class StereoRig(CameraRig):
     rectifier: Rectifier | None = None
     sources: tuple[int, ...] = (1, 0, 2)
     remarks: tuple[str, ...] = ()
+    format: str = ""
 
     def __post_init__(self) -> None:
         require_rig(self)
@@ -583,7 +585,8 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     remarks = (*remarks, *implausible(source, found.rig))
     straight = found.order[:2] == (0, 1) and fov_deg is None and _are_rectified(chosen, turn)
     kept = None if straight and found.correction is None else found
-    return _stereo_rig(found.rig, kept, sources, remarks)
+    rig = _stereo_rig(found.rig, kept, sources, remarks)
+    return replace(rig, format=calibration.format)
 
 
 def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:

@@ -48,6 +48,7 @@ from fgslam.datasets.depth import (
     depth_rig,
     depth_sigma_px,
     depth_unit,
+    entry_of_depth,
     require_one_camera,
     sample_depths,
 )
@@ -59,6 +60,7 @@ from fgslam.datasets.images import (
     shown_together,
 )
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
+from fgslam.datasets.ledger import Entry, entry_of_pairs
 from fgslam.datasets.odometry import (
     POSE_COLUMNS,
     RATE_COLUMNS,
@@ -111,6 +113,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     rows, unpaired = pair_stamps(bag.stamps[chosen.right], others, chosen.right)
     places = np.column_stack([bag.places[v][rows[:, k]] for k, v in enumerate(views)])
     right, size, sigma = places[:, 0].tolist(), rig.image_size, None
+    unit: tuple[Entry, ...] = ()
     bits, held = bits_held(len(right), lambda k: bag.read(right[k], messages.stored_of))
     bag.bits = bits
     held += mosaic_note(len(right), lambda k: bag.image(right[k]))
@@ -133,6 +136,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
             stated = MILLIMETRES  # REP 118
         scale, reported = depth_unit(where, seen, of_integers, stated)
         placed = replace(placed, notes=(*placed.notes, *reported))
+        unit = (entry_of_depth(scale, reported, stated is not None or not of_integers),)
         load = depth_images(read, rig, placed.cameras[1])
         sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
         unpaired = colour_and_depth_notes(unpaired)
@@ -156,7 +160,11 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         _odometry_source(chosen.motion, *bag.motions, odometry),
     )
     frame: PoseFrame = "right" if chosen.depth else "left"  # the colour camera's
-    return replace(recording, disparity_sigma_px=sigma, truth_frame=frame)
+    shown = f"{chosen.left} is {'depth' if chosen.depth else 'left'}, {chosen.right} right"
+    how = "--topics" if settings.topics else "types and names of topics"
+    topics = Entry("images", shown, how, "--topics", not settings.topics)
+    ledger = (*recording.ledger, topics, entry_of_pairs(unpaired), *unit)
+    return replace(recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger)
 
 
 # --------------------------------------------------------------------------------------------

@@ -40,6 +40,7 @@ from fgslam.datasets.layouts import (
     counts_by_one,
     images_in,
 )
+from fgslam.datasets.ledger import Entry, entry_of_pairs, entry_of_times
 from fgslam.datasets.recording import (
     Recording,
     image_recording,
@@ -204,7 +205,15 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
     name, truth = root.resolve().name, root / "groundtruth.txt"
     recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
     sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
-    recording = replace(recording, disparity_sigma_px=sigma, truth_frame="right")
+    lens = camera.model if camera.distortion.any() else "none"
+    ledger = (
+        *recording.ledger,
+        Entry("lens model", lens, settings.camera_file or str(root), "--camera"),
+        entry_of_depth(scale, reported, stated is not None),
+        entry_of_times(lists, notes, settings.fps),
+        entry_of_pairs(notes),
+    )
+    recording = replace(recording, disparity_sigma_px=sigma, truth_frame="right", ledger=ledger)
     if not truth.is_file():
         return recording
     return with_truth(recording, read_tum(truth), truth, stamps)
@@ -369,6 +378,13 @@ def depth_unit(
         )
     taken = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
     return scale, (*caveat, taken)
+
+
+def entry_of_depth(scale: float, reported: tuple[str, ...], stated: bool) -> Entry:
+    """The unit of depth for the ledger."""
+    source = "the recording, its calibration or the settings" if stated else reported[0]
+    value = f"{scale:g} units a metre"
+    return Entry("unit of depth", value, source, "dataset.depth_scale", not stated)
 
 
 def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:

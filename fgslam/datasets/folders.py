@@ -17,6 +17,7 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.sensors import PoseFrame
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import files_of, find_cameras
+from fgslam.datasets.ledger import Entry, entry_of_pairs, entry_of_times
 from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
@@ -207,4 +208,11 @@ def open_loose_images(
     files_of_it = [*lists, *wheels], (path for pair in pairs for path in pair)
     notes = (*mounting, *noticed, *others, *unpaired, *assumed)
     name = root.resolve().name
-    return image_recording(settings, name, rig, stamps, images, files_of_it, notes, source)
+    found = image_recording(settings, name, rig, stamps, images, files_of_it, notes, source)
+    cameras_by = f"{own.name} is the right camera's" if own != root else "names with the side"
+    ledger = (
+        Entry("images", cameras_by, "names of folders and files"),
+        entry_of_times(lists, assumed, settings.fps),
+        entry_of_pairs(unpaired),
+    )
+    return replace(found, ledger=(*found.ledger, *ledger))

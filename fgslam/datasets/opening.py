@@ -19,6 +19,8 @@ from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.log import MeasurementRecording
+from fgslam.core.sensors import body_is_camera
+from fgslam.datasets.ledger import Entry
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     FileRecordingSettings,
@@ -69,7 +71,45 @@ def open_recording(
     if found.rectifier is not None and found.unrectified:
         misfit = fit_notes(lambda i: found.frame(i).images, len(found), found.rectifier)
         found = replace(found, notes=(*misfit, *found.notes))
+    found = replace(found, ledger=ledger_of(found, settings))
     return found if settings.scale == 1.0 else smaller(found, settings.scale)
+
+
+def ledger_of(recording: Recording, settings: Any) -> tuple[Entry, ...]:
+    """All entries of a recording that is opened by these settings."""
+    known = None if recording.rectifier is None else recording.rectifier.calibration
+    given = getattr(settings, "camera_file", None)
+    source = str(given or settings.path) if known is None else known.source
+    entries = {entry.what: entry for entry in recording.ledger}
+    if (unit := float(getattr(settings, "unit_m", 1.0))) != 1.0:
+        entries["unit of length"] = Entry("unit of length", f"{unit:g} m", "--unit", "--unit")
+    elif not {"unit of depth", "unit of length"} & entries.keys():
+        why = f"the format of {source}"
+        entries["unit of length"] = Entry("unit of length", "1 m", why, "--unit")
+    if known is not None:
+        models = sorted({camera.model for camera in known.cameras})
+        stated = getattr(settings, "lens", None) is not None
+        decided = any("states the lens model" in note for note in recording.notes)
+        guessed = bool(known.guessed_lens) or decided
+        option = "dataset.lens" if guessed or stated else ""
+        lens = Entry("lens model", ", ".join(models), source, option, guessed)
+    else:
+        lens = Entry("lens model", "none, images are rectified", source)
+    entries.setdefault("lens model", lens)
+    stamps, truth = recording.timestamps, recording.ground_truth
+    span = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s"
+    rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0]) if len(stamps) > 1 else np.nan
+    entries["rate and span"] = Entry("rate and span", f"{rate:.3g} Hz, {span}", "the stamps")
+    if truth is not None:
+        its = f", {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s" if len(truth) else ""
+        value = f"{len(truth)} of {len(stamps)} frames{its}"
+        entries["truth"] = Entry("truth", value, settings.path)
+    if recording.odometry_source is not None:
+        ahead = next((n for n in recording.notes if "taken to look straight ahead" in n), "")
+        frame = "of the camera" if body_is_camera(recording.rig.bTc) else "of the robot's body"
+        why, option = ahead or settings.path, "dataset.camera_yaw_deg, dataset.lever_arm_m"
+        entries["odometry"] = Entry("odometry", f"its frame is {frame}", why, option, bool(ahead))
+    return tuple(entries.values())
 
 
 def _by_lens(

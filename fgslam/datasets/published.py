@@ -29,6 +29,7 @@ from fgslam.core.sensors import body_is_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
+from fgslam.datasets.ledger import Entry, entry_of_pairs
 from fgslam.datasets.odometry import (
     SPEED_COLUMNS,
     gyroscope_odometry,
@@ -122,6 +123,9 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         (*noticed, *paired),
         source,
     )
+    sides = Entry("images", f"{right[0].parent.parent.name} is right", "their poses (T_BS)")
+    ledger = (sides, Entry("times", "stamps", "data.csv"), entry_of_pairs(paired))
+    recording = replace(recording, ledger=(*recording.ledger, *ledger))
     places = ("state_groundtruth_estimate0", "mocap0")  # TUM-VI tracks the gyroscope
     for place in places[: 1 if body_is_camera(rig.bTc) else 2]:
         if (body := read_body_truth(root / place)) is not None:

@@ -23,6 +23,7 @@ from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import ImageLoader
+from fgslam.datasets.ledger import Entry
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
     OdometrySource,
@@ -63,6 +64,7 @@ class Recording(Brief):
             rectified.
         margins: of frames, in place of the rectifier's.
         disparity_sigma_px: noise of the disparity where a depth camera gives it, or None.
+        ledger: what is taken to be so, with its source.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Recording(Brief):
     rectifier: Rectifier | None = None
     margins: tuple[npt.NDArray[np.float32], ...] = ()
     disparity_sigma_px: float | None = None
+    ledger: tuple[Entry, ...] = ()
 
     @property
     def unrectified(self) -> bool:
@@ -147,7 +150,11 @@ def image_recording(
     """
     indices = select_frames(len(stamps), settings, settings.path)
     plain, rectifier = rig, None
+    ledger: tuple[Entry, ...] = ()
     if isinstance(rig, StereoRig):
+        if rig.format.startswith("OpenCV"):
+            why = f"{rig.format} states none"
+            ledger = (Entry("unit of length", "1 m", why, "--unit", True),)
         plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
     return Recording(
         name,
@@ -159,6 +166,7 @@ def image_recording(
         load_images,
         odometry_source=odometry_source,
         rectifier=rectifier,
+        ledger=ledger,
     )
 
 

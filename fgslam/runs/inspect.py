@@ -81,7 +81,9 @@ def inspect_recording(
         ("images read", f"{share(count, len(sequence))} frames{more}"),
         *match_facts(matched, sequence.rig, stereo),
     )
-    return render_report((*facts_of(sequence), *_opening_facts(config)), seen, findings)
+    ledger = [(entry.what, entry.shown) for entry in getattr(sequence, "ledger", ())]
+    facts = (*facts_of(sequence), *ledger, *_opening_facts(config))
+    return render_report(facts, seen, findings)
 
 
 def check_sequence(

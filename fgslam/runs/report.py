@@ -26,6 +26,7 @@ from fgslam.core.types import (
     read_covariances,
 )
 from fgslam.core.yaml_text import plain_values
+from fgslam.datasets.ledger import of_values
 from fgslam.evaluation.judging import (
     Answer,
     JudgedClosure,
@@ -381,6 +382,17 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     if (file := find(LOOPS_FILE)) is not None:
         places, closures = read_closures(file)
         tables += [places] if places.rows else []
+    if entries := of_values(metrics.get("ledger")):
+        rows = tuple(
+            (e.what, (e.value, "guessed: " * e.guessed + e.source, e.option or "-"))
+            for e in entries
+        )
+        columns = (
+            Column("taken as", "what figures rest on"),
+            Column("source", "where that is stated, or how it was guessed"),
+            Column("changed by", "the option that states otherwise"),
+        )
+        tables.append(TextTable("ledger", "What the figures rest on", "", columns, rows))
     provenance = _section(config, "provenance")
     dataset = str(_section(provenance, "dataset").get("name") or "")
     frames, odometry = metrics.get("frames"), metrics.get("odometry")

@@ -30,6 +30,7 @@ from fgslam.core.log import (
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig, moved_pixels
 from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures, Trajectory
+from fgslam.datasets.ledger import UNITS, Entry, as_values
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, align, associate
@@ -588,6 +589,7 @@ class RunOutputs:
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.remarks()),
+            "ledger": as_values(self.ledger),
             **run_numbers(self.recorder),
         }
         # Place recognition is asked for, or it joined parts of the map.
@@ -615,6 +617,11 @@ class RunOutputs:
         if found is not None:
             write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
         return load_truth(self.folder, self.recorder.log)
+
+    @property
+    def ledger(self) -> tuple[Entry, ...]:
+        """What is taken to be so of a recording of files; of others nothing is."""
+        return getattr(self.sequence, "ledger", ())
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""
@@ -669,6 +676,10 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         pairs = zip(bias["rates"], bias["sigmas"], strict=True)
         words = ", ".join(f"{rate:.3f} +- {sigma:.3f}" for rate, sigma in pairs)
         rows["gyroscope bias, x y z"] = f"{words} deg/s"
+    if guessed := [e for e in outputs.ledger if e.guessed and e.what in UNITS]:
+        rows = {name + " *" * (text.endswith((" cm", " m")) or " cm" in text): text
+                for name, text in rows.items()}  # fmt: skip
+        rows["* rests on a guess"] = "\n".join(f"{e.what}: {e.value} ({e.option})" for e in guessed)
     remark = f"\n{outputs.remark}" if outputs.remark else ""
     heading = f"{outputs.config.name}: {outputs.title}{remark}"
     cells = tuple((name, (value,)) for name, value in rows.items())

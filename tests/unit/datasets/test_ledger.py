@@ -1,0 +1,74 @@
+"""What is taken to be so of a recording: entries with their source, their option, and guesses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bags import stereo, write_bag
+from dataset_builders import HEIGHT, WIDTH, loose, picture, save, write_calibration
+
+from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.ledger import Entry, as_values, entry_of_pairs, of_values
+from fgslam.datasets.opening import open_recording
+from fgslam.runs.config import make_config
+
+
+def ledger(given: Path, **changes: Any) -> dict[str, Entry]:
+    keys = recognise_layout(given) | changes
+    found = open_recording(make_config({"name": "x", "dataset": keys}, "test").dataset)  # type: ignore[arg-type]
+    return {entry.what: entry for entry in found.ledger}
+
+
+def test_times_are_stated_given_or_guessed(tmp_path: Path) -> None:
+    root = loose(tmp_path, lambda k: (f"cam0/{k}.png", f"cam1/{k}.png"))
+    assert ledger(root)["times"] == Entry("times", "even", "nothing states them", "--fps", True)
+    assert ledger(root, fps=20.0)["times"].source == "--fps"
+    (root / "times.txt").write_text("0.0\n0.1\n0.3\n", encoding="utf-8")
+    assert ledger(root)["times"] == Entry("times", "stamps", str(root / "times.txt"), "--fps")
+
+
+def test_a_unit_of_length_that_opencv_does_not_state_is_a_guess(tmp_path: Path) -> None:
+    loose(tmp_path, lambda k: (f"cam0/{k}.png", f"cam1/{k}.png"))
+    assert not ledger(tmp_path)["unit of length"].guessed
+    matrix = [[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]]
+    values = {"image_size": [WIDTH, HEIGHT], "R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0]}
+    values |= {f"M{k}": matrix for k in (1, 2)} | {f"D{k}": [0.01, 0, 0, 0, 0] for k in (1, 2)}
+    (tmp_path / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+    found = ledger(tmp_path)
+    assert found["unit of length"].guessed
+    assert found["unit of length"].option == "--unit"
+    assert found["lens model"].value == "radtan"
+    assert not ledger(tmp_path, unit_m=0.5)["unit of length"].guessed
+
+
+def test_the_unit_of_depth_is_a_guess_until_it_is_stated(tmp_path: Path) -> None:
+    for k in range(3):
+        save(tmp_path / "rgb" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+        save(tmp_path / "depth" / f"{k}.png", np.full((HEIGHT, WIDTH), 2000, np.uint16))
+    write_calibration(tmp_path)
+    assert ledger(tmp_path)["unit of depth"].guessed
+    found = ledger(tmp_path, depth_scale=1000.0)["unit of depth"]
+    assert (found.value, found.guessed) == ("1000 units a metre", False)
+    assert "unit of length" not in ledger(tmp_path)
+
+
+def test_topics_are_guessed_or_named(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "a.bag", stereo())
+    guessed = ledger(bag)["images"]
+    assert guessed.value == "/cam/left/image_raw is left, /cam/right/image_raw right"
+    assert guessed.guessed
+    named = ("/cam/left/image_raw", "/cam/right/image_raw")
+    assert not ledger(bag, topics=named)["images"].guessed
+
+
+def test_pairs_by_order_or_an_offset_are_guesses_and_entries_are_kept(tmp_path: Path) -> None:
+    assert not entry_of_pairs(()).guessed
+    by_order = entry_of_pairs(("left and right images are paired by their order: names differ",))
+    assert by_order.guessed
+    assert "guessed: left and right" in by_order.shown
+    stored = json.loads(json.dumps(as_values([by_order])))
+    assert of_values(stored) == (by_order,)
+    assert of_values(None) == of_values([{"what": 1}]) == ()
