@@ -35,6 +35,7 @@ from benchmarks.evidence import (
     sizes,
     variants,
     visits,
+    witnesses,
     wrong_mirror,
 )
 from benchmarks.measured import keep
@@ -65,6 +66,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "rig_honesty": rig_honesty.tables,
     "visits": lambda data: visits.tables(),
     "compact_memory": lambda data: compact_memory.tables(),
+    "witnesses": witnesses.tables,
     "wrong_mirror": lambda data: wrong_mirror.tables(),
     "unmapped": lambda data: relocalising.unmapped_tables(),
     "recognised": relocalising.recognised_tables,

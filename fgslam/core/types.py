@@ -534,6 +534,7 @@ class EgoMotionStatus(str, Enum):
     OK = "ok"
     CAPPED = "capped"
     RELOCALISED = "relocalised"
+    CONTRADICTED = "contradicted"
     TOO_FEW_MATCHES = "too_few_matches"
     DIVERGED = "diverged"
     NO_IMAGE = "no_image"
@@ -547,6 +548,7 @@ class EgoMotionStatus(str, Enum):
             EgoMotionStatus.OK,
             EgoMotionStatus.CAPPED,
             EgoMotionStatus.RELOCALISED,
+            EgoMotionStatus.CONTRADICTED,
         )
 
 

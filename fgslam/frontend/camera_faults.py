@@ -496,18 +496,21 @@ class CameraWatch:
         self._sums = [-1] * rig.cameras
         self._frames = 0
 
-    def look(self, images: tuple[Image, ...], number: int | None = None) -> str:
+    def look(
+        self, images: tuple[Image, ...], number: int | None = None, moved: bool = False
+    ) -> str:
         """Takes in a frame; what is wrong with its images, in words; empty where nothing is.
 
-        ``number``: of the frame, as remarks give it; None counts the frames taken in.
+        ``number``: of the frame, as remarks give it; None counts the frames taken in. ``moved``:
+        odometry has measured motion since the last frame.
         """
         now = Shrunk(images, self._factor)
-        repeated = self._repeated(images)
+        repeated = self._repeated(images, moved)
         swapped = ""
         points = now.corners()
         across = [followed(now.images[0], other, points) for other in now.images[1:]]
         shown = np.logical_or.reduce([kept for _, kept in across])
-        moved: Followed | None = None
+        flow: Followed | None = None
         seen: list[LineRows] = []
         for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
@@ -520,8 +523,8 @@ class CameraWatch:
             if repeated or swapped:
                 continue
             if self._before:
-                moved = moved or _followed_of(now.images[0], self._before[0], points, shown)
-                since = moved[0][kept], moved[1][kept]
+                flow = flow or _followed_of(now.images[0], self._before[0], points, shown)
+                since = flow[0][kept], flow[1][kept]
                 seen.append(self._judge(camera, now, (here, there), since))
             else:
                 seen.append(self._still(pair, here, there))
@@ -550,12 +553,12 @@ class CameraWatch:
 
     # ----------------------------------------------------------------------------------------
 
-    def _repeated(self, images: tuple[Image, ...]) -> str:
-        """That one camera's image is the last one's to the bit, while another's is not."""
+    def _repeated(self, images: tuple[Image, ...], moved: bool) -> str:
+        """That an image is the last one's to the bit, while another is not, or the robot moved."""
         before = self._sums
         self._sums = [zlib.crc32(image.tobytes()) for image in images]
         same = [a == b for a, b in zip(before, self._sums, strict=True)]
-        if not any(same) or all(same):
+        if not any(same) or (all(same) and not (moved and images[0].std() > _DARKEST)):
             return ""
         return f"{_named(same)} the image of the frame before once more"
 

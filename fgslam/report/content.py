@@ -432,15 +432,11 @@ def plain(value: Any) -> Any:
 # --------------------------------------------------------------------------------------------
 # Sentences of remarks: all of their words stand here
 
-_UNSURE = (
-    "something large passes{or_odometry}. Without odometry that separates them the pose is "
-    "uncertain where that fills more of the view than the scene, for it may follow what passes "
-    "(leave these frames out: --start, --stop)"
+_BODY = (
+    "something else moves in {count} frames, {span}: {percent:.0f} % of the matches there, between "
+    "{low:.0f} and {high:.0f} % of the width, contradict the odometry; "
 )
-_MOTION = (
-    "in {count} frames, {span}, something else moves rigidly, with up to {percent:.0f} % as many "
-    "matches as the pose follows: "
-)
+_ODOMETRY = "the odometry is wrong in {count} frames, {span}, which are located without it: "
 _PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "
 _WATCH = "frontend.watch_cameras: false uses them all"
 _FASTEN = (
@@ -452,6 +448,8 @@ _NO_MATCHES = (
     "{matched:.0f} of them matched"
 )
 SENTENCES = {
+    "body_fills_view": _BODY + "nothing else is in view there: the pose is by odometry alone",
+    "body_moves": _BODY + "the pose follows odometry and the rest of the view",
     "bridged": "{named}: not located in the first map; in the final trajectory interpolated "
     "between the located frames around, where that is more certain than what the estimator knows",
     "camera_fault": _PREDICTED + "(mend the camera; " + _WATCH + ")",
@@ -465,21 +463,27 @@ SENTENCES = {
     "no_features": _NO_MATCHES + "{left}; are the images dark, or 12-bit values in 16-bit images?",
     "no_matches": _NO_MATCHES + "{left}; are left and right swapped, or the images not rectified?",
     "no_matches_fault": _NO_MATCHES + "; {fault}",
-    "odometry_contradicted": "the odometry contradicts the images in {count} of {all} frames, "
-    "which are located without it: check its unit, its clock and where the camera sits on the "
-    "robot (dataset.camera_yaw_deg, dataset.lever_arm_m)",
-    "other_motion": _MOTION + _UNSURE.format(or_odometry=""),
-    "other_motion_or_odometry": _MOTION
-    + _UNSURE.format(
-        or_odometry=", or the odometry is wrong (its unit or clock, the camera's place on the "
-        "robot)"
-    ),
+    "odometry_reversed": _ODOMETRY + "it is the motion backwards ({ratio:.2f} of the way that "
+    "images show): give the pose now in the frame before, not its inverse",
+    "odometry_scaled": _ODOMETRY + "its ways are {ratio:.2f} +- {scatter:.2f} of those that images "
+    "show (wheel radius, unit)",
+    "odometry_slips": _ODOMETRY + "images show other ways, by no fixed factor (the wheels slip, "
+    "its clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
+    "odometry_stuck": _ODOMETRY + "it states no motion while images show one",
+    "other_motion": "in {count} frames, {span}, something else moves rigidly, with up to "
+    "{percent:.0f} % as many matches as the pose follows: something large passes. Without odometry "
+    "the pose is uncertain where that fills more of the view than the scene, for it may follow "
+    "what passes (leave these frames out: --start, --stop)",
+    "scene_repeats": "the scene repeats itself in {count} frames, {span}: images fit several "
+    "places alike, the pose is by odometry",
     "unconnected": "{named}: located relative to each other only, not in the first map; before is "
     "a gap that neither landmarks nor odometry bridge; {known} of {all} frames ({percent:.0f} %) "
     "are located in the first map",
     "unequal_exposure": "the {camera} images were darker or brighter than the right ones by more "
     "than a third of a stop in {count} of {all} frames; give all cameras one exposure time and "
     "gain",
+    "witnesses_undecided": "odometry and images contradict each other in {count} frames, {span}, "
+    "and nothing in view shows which errs; the pose follows the images, its covariance holds both",
 }
 """By the code of a :class:`~fgslam.core.types.Remark`."""
 

@@ -48,22 +48,34 @@ Status: TypeAlias = Literal["finished", "interrupted"]
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
 
+_UNDECIDED = 15
+"""Frames that follow images which odometry contradicts, with nothing to tell which of the two errs,
+from which on a run is no success."""
+
+
 @dataclass(frozen=True, slots=True)
 class LocatedShare:
     """How many frames (or queries) what was seen gave a pose in the map, of how many.
 
     Attributes:
         least: share that is a success.
+        undecided: frames for which nothing shows whether images or odometry are right.
     """
 
     frames: int
     of: int
     least: float = 0.5
+    undecided: int = 0
+
+    @property
+    def decided(self) -> bool:
+        """Whether next to no frame is undecided."""
+        return self.undecided < _UNDECIDED
 
     @property
     def enough(self) -> bool:
-        """Whether so many were; less is no success, and `fgslam` exits with 3."""
-        return self.frames >= self.least * self.of
+        """Whether so many were, decided; less is no success, and `fgslam` exits with 3."""
+        return self.frames >= self.least * self.of and self.decided
 
     def __str__(self) -> str:
         share = 100.0 * self.frames / self.of if self.of else 0.0

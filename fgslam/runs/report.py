@@ -142,13 +142,20 @@ def located(recorder: RunRecorder, parts: MapParts) -> LocatedShare:
     Of all, with those before the first one.
     """
     all_of = recorder.left_out + len(recorder)
-    return LocatedShare(in_first_map(recorder, parts), all_of, _LEAST_IN_MAP)
+    status = recorder.column("status")
+    undecided = int((status == EgoMotionStatus.CONTRADICTED.value).sum())
+    return LocatedShare(in_first_map(recorder, parts), all_of, _LEAST_IN_MAP, undecided)
 
 
 def alarms(share: LocatedShare | None, landmarks: object) -> tuple[str, ...]:
     """What makes a run no success, in sentences: too few frames in its map, or no map."""
     found = ["No success: there is no map, not one landmark was kept."] if landmarks == 0 else []
-    if share is not None and not share.enough:
+    if share is not None and not share.decided:
+        found.append(
+            f"No success: images and odometry contradict each other in {share.undecided} frames, "
+            "and nothing in view shows which errs."
+        )
+    elif share is not None and not share.enough:
         found.append(
             f"No success: {share} were located in the map; where the others are is predicted, or "
             "known relative to each other only."

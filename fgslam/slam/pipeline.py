@@ -33,6 +33,7 @@ from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
+from fgslam.slam.witnesses import Frame, Witnesses, has_moved
 
 if TYPE_CHECKING:
     from fgslam.backend.self_calibration import SelfCalibration
@@ -53,6 +54,7 @@ class SlamPipeline:
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
         key_frames: tracking between key frames; None where every frame is one.
         watch: which frames' images cannot be used; None uses all.
+        witnesses: decides between images and odometry where they contradict each other.
         describe: finds the features of a frame that came without: of all images, or of the
             reference image where patches measure the rest (`frontend.stereo.others`).
         describe_reference: of the first frame, and of one that tracked patches have located,
@@ -77,8 +79,13 @@ class SlamPipeline:
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
     rewound: bool = False
     watch_of_frame: Stopwatch = field(default_factory=Stopwatch, init=False)
+    witnesses: Witnesses = field(init=False)
     _ended: Kept[IntArray] = field(default_factory=no_ids, init=False)
     _tried: tuple[FeatureFrame, StereoFeatures] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Begins with witnesses that agree."""
+        self.witnesses = Witnesses(self.tracker, self.estimator.kind != "odometry")
 
     def process(
         self, frame: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
@@ -93,26 +100,30 @@ class SlamPipeline:
         """
         self.watch_of_frame = Stopwatch()
         before = self._before(frame)
-        frame = self._check_cameras(frame, index)  # late, frozen, swapped images are not used
+        frame = self._check_cameras(frame, index, body)  # late, frozen, swapped images are not used
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
         carried = self._track_patches(prediction, frame, landmarks)  # between key frames
-        if self.key_frames and carried and self._needs_no_features(carried):
+        if self.key_frames and carried and self._needs_no_features(carried, odometry, prediction):
             stereo, features = carried.carried.features, None
             matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
         else:
             frame = self._find_features(frame, carried, before)  # 2.1
             every = self._match_stereo(frame)  # 2.2
-            measured = odometry is None or odometry.measured
-            every, matched = self._track(prediction, frame, every, landmarks, carried, measured)
+            every, matched = self._track(
+                Frame(index, odometry, prediction, landmarks, every), frame, carried
+            )
+            odometry = matched.odometry
             stereo = features = every.whole
             matched = self._recognise_places(matched, stereo, landmarks)
         matched = self._end_landmarks(matched)
         increment = self._increment(index, timestamp, odometry, matched)  # what the log holds
         stats, noise = self._update(increment, matched.ego_motion)  # 6.4
-        if features is not None:
+        if features is not None and not _known(odometry):
             self._look_for_other_motion(index, features, matched, stats)
         self._calibrate(increment, stats)
+        mixed = stats.covariance + self.witnesses.open_covariance(stats.wTc)
+        stats = dataclasses.replace(stats, covariance=mixed)
         times = self.watch_of_frame.ms
         return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)
 
@@ -127,11 +138,13 @@ class SlamPipeline:
         return [(part, snapshot(part)) for part in parts if has_state(part)]
 
     @timed("watch")
-    def _check_cameras(self, frame: FeatureFrame, index: int) -> FeatureFrame:
+    def _check_cameras(
+        self, frame: FeatureFrame, index: int, body: Odometry | None = None
+    ) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""
         if self.watch is None or frame.frame is None:
             return frame
-        fault = self.watch.look(frame.frame.images, index)
+        fault = self.watch.look(frame.frame.images, index, has_moved(body))
         if not fault:
             return frame
         return dataclasses.replace(frame, frame=None, features=(), problem=fault, refused=True)
@@ -167,9 +180,14 @@ class SlamPipeline:
             return None
         return self.key_frames.carry(prediction, landmarks, frame.frame.images, self._correction())
 
-    def _needs_no_features(self, carried: CarriedFrame) -> bool:
-        """Whether enough patches are tracked, and no place is looked for."""
-        return carried.suffices and (self.places is None or not self.places.wants_features)
+    def _needs_no_features(
+        self, carried: CarriedFrame, odometry: Odometry | None, prediction: Prediction
+    ) -> bool:
+        """Whether enough patches are tracked, none contradicts, and no place is looked for."""
+        if not carried.suffices or (self.places is not None and self.places.wants_features):
+            return False
+        pose = carried.tracked.ego_motion
+        return not self.witnesses.contradicts(odometry, prediction, pose)
 
     @timed("sift")
     def _find_features(
@@ -203,22 +221,14 @@ class SlamPipeline:
 
     @timed("track")
     def _track(
-        self,
-        prediction: Prediction,
-        frame: FeatureFrame,
-        stereo: StereoFeatures,
-        landmarks: LandmarkMap,
-        carried: CarriedFrame | None,
-        measured: bool,
+        self, now: Frame, frame: FeatureFrame, carried: CarriedFrame | None
     ) -> tuple[StereoFeatures, Matched]:
-        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3).
-
-        ``measured``: its prediction is by odometry.
-        """
+        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
+        prediction, landmarks, stereo = now.prediction, now.landmarks, now.features
         if frame.frame is None:
             status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
             blind = self.tracker.track_blind(prediction, status)
-            return stereo, Matched(blind, Association.nothing())
+            return stereo, Matched(blind, Association.nothing(), now.odometry)
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
@@ -229,20 +239,27 @@ class SlamPipeline:
             located = again.ego_motion.status.measured
             tracked = again if located else tracked
         elif self.places is not None and frame.i > 0:  # where the prediction failed
+            guessed = now.odometry is not None and not now.odometry.measured
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
-            tracked, located = self.places.recover(tracked, landmarks, stereo.whole, not measured)
+            tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
             initialises = self.places.maps_on
-        relocalised = located or tracked.ego_motion.status is EgoMotionStatus.RELOCALISED
+        judged = self.witnesses.judge(now._replace(features=stereo), tracked)
+        tracked = judged.tracked
+        relocalised = judged.by_images or (located and judged.verdict == "agreed")
         image = frame.frame.images[0]
-        if self.key_frames is None:
-            association = self.tracker.associate(tracked, stereo, image, initialises)
-        else:
+        if self.key_frames is not None:
             tracked = spread(tracked, stereo)
-            association = self.tracker.associate(tracked, stereo, image, initialises)
+        association = self.tracker.associate(tracked, stereo, image, initialises, judged.settled)
+        if len(judged.ended):
+            self.tracker.database.drop(judged.ended)
+            pruned = np.union1d(association.pruned_ids, judged.ended)
+            association = dataclasses.replace(association, pruned_ids=pruned)
+        if self.key_frames is not None:
             self.key_frames.begin(image, stereo, association)
         if frame.i == 0 and not len(landmarks):
-            return stereo, Matched(unmeasured(prediction, EgoMotionStatus.FIRST), association)
-        return stereo, Matched(tracked.ego_motion, association, relocalised=relocalised)
+            first = unmeasured(prediction, EgoMotionStatus.FIRST)
+            return stereo, Matched(first, association, now.odometry)
+        return stereo, Matched(tracked.ego_motion, association, judged.step, (), relocalised)
 
     @timed("places")
     def _recognise_places(
@@ -291,6 +308,7 @@ class SlamPipeline:
         noise = noise_in_use(self.motion, increment.odometry, self.tracker.noise, self.estimator)
         observe(self.motion, increment, ego_motion, stats)
         self.tracker.noise.learn(ego_motion)
+        self.witnesses.observe(increment, ego_motion)
         self.tracker.parts.record(increment, stats.closed)
         if self.places is not None:
             self.places.remember(increment, ego_motion.wTc, stats)
@@ -342,7 +360,7 @@ class SlamPipeline:
         found = self.estimator.estimate()
         if len(self._ended):
             found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
-        return bridged(found, self.tracker.parts)
+        return bridged(self.witnesses.spread(found), self.tracker.parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,6 +369,7 @@ class Matched:
 
     ego_motion: EgoMotion
     association: Association
+    odometry: Odometry | None = None
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
 

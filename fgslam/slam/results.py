@@ -151,7 +151,8 @@ class Step(Brief):
         wTc: (4, 4) pose of the right camera in the world, metres.
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space
             at ``wTc``: ``T = wTc * Exp(xi)``.
-        status: how the pose was found: `first`, `ok`, `capped`, `relocalised`; or, by odometry
+        status: how the pose was found: `first`, `ok`, `capped`, `relocalised`, `contradicted` (by
+            images that odometry contradicts, and nothing decides between them); or, by odometry
             alone, `too_few_matches`, `diverged`, `no_image`, `camera_fault`; or not at all,
             `not_located` in the map that the session is to begin in: pose and covariance are NaN.
         matches: the k landmarks of the map that the frame sees again: ids (k,), (column, row,
@@ -428,7 +429,7 @@ def _image_remarks(recorder: RunRecorder, seen: FirstImages) -> Iterator[Remark]
 
 
 # ------------------------------------------------------------------------------------------
-# Remarks on frames that a guess alone places relative to the rest, or that contradict odometry
+# Remarks on frames that a guess alone places relative to the rest
 
 
 def located_frames(recorder: RunRecorder) -> BoolArray:
@@ -457,6 +458,7 @@ def session_remarks(
         *camera_remarks(recorder),
         *(() if watch is None else watch.remarks()),
         *_image_remarks(recorder, seen or FirstImages()),
+        *pipeline.witnesses.remarks(),
         *pipeline.tracker.other_motion.remarks(),
     )
 
@@ -478,7 +480,7 @@ def camera_remarks(recorder: RunRecorder) -> tuple[Remark, ...]:
 
 
 def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[Remark, ...]:
-    """On frames that nothing measured, that lie in parts of their own, or off odometry."""
+    """On frames that nothing measured, or that lie in parts of their own."""
     out, numbers, n = [], recorder.log.numbers, len(recorder)
     bridged = bridged_frames(parts)
     bridged = bridged[bridged < n]
@@ -489,12 +491,4 @@ def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[Remark, ...]:
         known = in_first_map(recorder, parts)
         values = {"known": known, "all": n, "percent": 100.0 * known / n}
         out.append(Remark("unconnected", tuple(numbers[apart].tolist()), values))
-    again = recorder.column("status") == EgoMotionStatus.RELOCALISED.value
-    if 2 * int(again.sum()) > n:  # the log is read only where it may be so
-        steps = [one.odometry for one in recorder.log]
-        moved = np.array([step is not None and step.measured for step in steps], np.bool_)
-        contradicted, all_moved = int((again & moved).sum()), int(moved.sum())
-        if 2 * contradicted > all_moved:
-            values = {"count": contradicted, "all": all_moved}
-            out.append(Remark("odometry_contradicted", values=values))
     return tuple(out)

@@ -138,7 +138,7 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    squared = _squared_distances(a, b)
+    squared = squared_distances(a, b)
     i = np.arange(len(a))
     j = np.argmin(squared, axis=1)
     best = squared[i, j]
@@ -151,7 +151,8 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     return i[mutual], j[mutual]
 
 
-def _squared_distances(a: ByteArray, b: ByteArray) -> npt.NDArray[np.float32]:
+def squared_distances(a: ByteArray, b: ByteArray) -> npt.NDArray[np.float32]:
+    """Squared distances (n, m) of descriptors (n, 128) and (m, 128)."""
     # Exact in float32: every sum of 128 products of bytes is below 2^24.
     x, y = a.astype(np.float32), b.astype(np.float32)
     out = np.asarray((-2.0 * x) @ y.T, np.float32)

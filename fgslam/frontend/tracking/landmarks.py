@@ -329,6 +329,10 @@ class LandmarkDatabase:
         if len(np.unique(ends)) < len(ends) or np.isin(ends, stays).any():
             raise ValueError("a landmark can end only once, and not stay as well")
 
+    def drop(self, ids: IntArray) -> None:
+        """Forgets landmarks (k,); those that it does not hold are none."""
+        self._remove(np.isin(self.ids, ids))
+
     def _remove(self, gone: BoolArray) -> None:
         if gone.any():
             self._pool.release(self._places[gone])

@@ -75,7 +75,7 @@ class LandmarkTracker:
         """
         self.keeps_map = False
         self.expects_returns = False
-        self._rig = rig
+        self.rig = rig
         self.database = database
         self._matcher = matcher
         self._ego_motion = ego_motion
@@ -89,7 +89,7 @@ class LandmarkTracker:
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
         """Matches expected landmarks, solves for the pose; wider or again around it if set so."""
-        around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
+        around = self.constrained(prediction)
         tracked = self.match_and_solve(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
             rescued = self.match_and_solve(prediction, around, landmarks, features, anywhere=True)
@@ -142,7 +142,7 @@ class LandmarkTracker:
             return None
         rows = expected.rows
         covariance = predicted_covariance(
-            self._rig, around, landmarks.positions[rows], landmarks.covariances[rows]
+            self.rig, around, landmarks.positions[rows], landmarks.covariances[rows]
         )
         return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
@@ -195,26 +195,31 @@ class LandmarkTracker:
         expected = tracked.expected
         points = transform_to_camera(tracked.ego_motion.wTc, landmarks.positions[expected.rows])
         ahead = in_front(points)
-        shift = project(self._rig, points[ahead]) - expected.measurement[ahead]
+        shift = project(self.rig, points[ahead]) - expected.measurement[ahead]
         return bool(np.median(np.abs(shift[:, :2]).max(axis=1)) > REFINE_SHIFT_PX)
 
     def associate(
-        self, tracked: Tracked, features: StereoFeatures, image: Image, start_new: bool = True
+        self,
+        tracked: Tracked,
+        features: StereoFeatures,
+        image: Image,
+        start_new: bool = True,
+        misses: bool = True,
     ) -> Association:
-        """Records hits and misses, initiates landmarks if allowed, prunes (4.1 to 4.3)."""
+        """Records hits and misses, initiates landmarks, if allowed, and prunes (4.1 to 4.3)."""
         expected, matches = tracked.expected, tracked.matches
         inliers = tracked.ego_motion.inliers
         matched = _matched(expected, matches, features)
         if self.keeps_map:
             none = np.empty(0, np.int64)
             return Association(matched, ~inliers, none, none, matches.features)
-        missed_ids = self._missing(tracked)
+        missed_ids = self._missing(tracked) if misses else np.empty(0, np.int64)
         directions = directions_to(tracked.ego_motion.wTc, features.position)
         upright = self._upright(features, tracked.ego_motion.wTc)
         seen = matches.features[inliers]
         self.database.record_hits(matched.ids[inliers], upright, seen, directions[seen])
         self.database.record_misses(missed_ids)
-        if tracked.ego_motion.status.measured:
+        if misses and tracked.ego_motion.status.measured:
             rejected = matched.ids[~inliers]
             self.database.weigh(expected, missed_ids, rejected, features.whole.measurement)
         fresh = np.flatnonzero(~matches.had_candidates & start_new)
@@ -239,7 +244,7 @@ class LandmarkTracker:
 
     def _upright(self, features: StereoFeatures, wTc: FloatArray) -> StereoFeatures:
         """The features with their orientations as a level camera sees them."""
-        level = features.orientation - lean(self._rig, wTc, features.position)
+        level = features.orientation - lean(self.rig, wTc, features.position)
         return replace(features, orientation=level)
 
     def associate_carried(self, tracked: Tracked, features: StereoFeatures) -> Association:
@@ -258,7 +263,16 @@ class LandmarkTracker:
 
     def expected(self, prediction: Prediction, landmarks: LandmarkMap) -> ExpectedLandmarks:
         """Landmarks that may be in view of the prediction, as the floor allows it."""
-        return self.database.expected(landmarks, self._ego_motion.floor.constrain(prediction.wTc))
+        return self.database.expected(landmarks, self.constrained(prediction).wTc)
+
+    def constrained(self, prediction: Prediction) -> Prediction:
+        """The prediction on the floor."""
+        return Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
+
+    def fits(self, wTc: FloatArray, problem: PoseProblem, slack: float = 1.0) -> BoolArray:
+        """Which matches (k,) a pose explains, by ``slack`` times the bound of an inlier."""
+        farthest = slack * self._ego_motion.farthest
+        return self._ego_motion.image_residuals(wTc, problem) <= farthest
 
     def matched_around(
         self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
@@ -540,10 +554,8 @@ class OtherMotion:
         """On the frames with two motions; none where there are none."""
         if not self._contradicting:
             return ()
-        most = max(self._contradicting.values())
-        # The pose follows the fewer matches only where odometry, or the map, does.
-        code = "other_motion" if most <= 1.0 else "other_motion_or_odometry"
-        return (Remark(code, tuple(sorted(self._contradicting)), {"percent": 100.0 * most}),)
+        percent = 100.0 * max(self._contradicting.values())
+        return (Remark("other_motion", tuple(sorted(self._contradicting)), {"percent": percent}),)
 
     def _share(
         self, features: StereoFeatures, left: IntArray, old: IntArray, tracking: EgoMotion

@@ -467,6 +467,7 @@ def _parts(pipeline: SlamPipeline, recorder: RunRecorder) -> dict[str, Any]:
         "estimator": pipeline.estimator,
         "motion": pipeline.motion,
         "pipeline": pipeline,
+        "witnesses": pipeline.witnesses,
         "recorder": recorder,
         "places": pipeline.places,
         "calibration": pipeline.calibration,

@@ -14,10 +14,14 @@ SAMPLES = {
     "degrees": 0.456,
     "fault": "the left camera delivers old images",
     "features": 312.4,
+    "high": 87.6,
     "known": 150,
+    "low": 12.3,
     "left": " (290 in the left image)",
     "matched": 1.2,
     "percent": 75.0,
+    "ratio": 1.494,
+    "scatter": 0.006,
     "turns": "0.46 degrees in yaw (9 sigma)",
 }
 OF_FRAMES = ("{named}", "{span}", "{first}")

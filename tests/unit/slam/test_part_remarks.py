@@ -7,7 +7,7 @@ from simulated import RIG
 
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Odometry
-from fgslam.core.types import Remark, StereoFeatures
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.results import FrameRow, RunRecorder, in_first_map, part_remarks
 
@@ -58,13 +58,3 @@ def test_frames_beyond_a_gap_are_reported() -> None:
 def test_a_frame_that_failed_is_not_counted() -> None:
     parts = Apart([True, True, False, True, True, True])
     assert in_first_map(recorded(STATUSES), parts) == 4
-
-
-def test_odometry_against_which_most_frames_are_located_is_reported() -> None:
-    statuses = ["first", "relocalised", "ok", "relocalised", "relocalised"]
-    connected = Apart([True] * 5)
-    step = Odometry(np.eye(4), np.eye(6))
-    (remark,) = part_remarks(recorded(statuses, step), connected)
-    assert remark == Remark("odometry_contradicted", values={"count": 3, "all": 5})
-    assert part_remarks(recorded(statuses), connected) == ()  # a guess alone was contradicted
-    assert part_remarks(recorded(STATUSES, step), connected) == ()

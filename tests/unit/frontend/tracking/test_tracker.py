@@ -8,15 +8,13 @@ import math
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from passing import PASSING_RIG, SCENE, pair_of
 from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
-from textured_room import TEXTURE
 
 from fgslam.core import geometry as g
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
-from fgslam.core.sensors import CameraRig
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.store import restore, state_of
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.settings import (
@@ -699,33 +697,9 @@ def test_doubles_seen_before_do_not_hide_what_the_last_frame_saw(scene: Scene) -
 # A second rigid motion in the view: something large that passes, or nothing but the scene
 
 
-PASSING_RIG = CameraRig(240, 180, 180.0, 180.0, 119.5, 89.5, 0.12, None, np.eye(4))
-SCENE = ((5.0, -9.0, 9.0), (3.0, -1.6, -0.9), (2.5, 0.7, 1.5))
-"""Planes that face the camera: depth, left and right edge in metres."""
 BOARD_M = 0.5
 FRAMES = 6
 _SLOW_S = 0.05
-
-
-def seen(planes: list[tuple[float, float, float]], x: float, z: float) -> Image:
-    """What a camera at (x, 0, z) sees of planes, far ones first."""
-    size = (PASSING_RIG.width, PASSING_RIG.height)
-    image = np.zeros(size[::-1], np.float32)
-    for k, (depth, left, right) in enumerate(planes):
-        texels = 70.0 if k < len(SCENE) else 200.0  # of a metre
-        texture = np.asarray(np.roll(TEXTURE, 97 * k, axis=1)[:, : int(texels * (right - left))])
-        scale = PASSING_RIG.fx / (depth - z)
-        of_texel = scale / texels
-        affine = np.array(
-            [
-                [of_texel, 0.0, scale * (left - x) + PASSING_RIG.cx],
-                [0.0, of_texel, PASSING_RIG.cy - 200 * of_texel],
-            ]
-        )
-        warped = cv2.warpAffine(texture.astype(np.float32), affine, size, flags=cv2.INTER_AREA)
-        there = cv2.warpAffine(np.ones(texture.shape, np.float32), affine, size)
-        image = np.where(there > 0.5, warped, image)
-    return np.asarray(np.clip(np.round(image), 0, 255), np.uint8)
 
 
 def drive(board_m: float, step_m: float) -> Session:
@@ -738,7 +712,7 @@ def drive(board_m: float, step_m: float) -> Session:
         ahead, left = 0.04 * k, -0.6 + step_m * k
         depth = board_m + (ahead if step_m else 0.0)
         planes = [*SCENE, (depth, left, left + BOARD_M)]
-        session.track(0.1 * k, tuple(seen(planes, x, ahead) for x in (-PASSING_RIG.baseline, 0.0)))
+        session.track(0.1 * k, pair_of(planes, 0.0, ahead))
     return session
 
 

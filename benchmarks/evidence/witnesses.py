@@ -1,0 +1,492 @@
+"""Images against odometry (docs/results): faults of either, and what the default live run says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+import fgslam as fg
+from benchmarks.runs import say
+from benchmarks.tables import Cell, Table
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.geometry import (
+    compose_odometry,
+    inverse,
+    pose,
+    rotation_angle,
+    se3_exp,
+    so3_exp,
+)
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Remark
+from fgslam.report.content import sentence
+from fgslam.runs.report import located
+from fgslam.slam.session import Session
+
+BEGINS = 12
+"""Frame from which on a fault that is not there from the start acts."""
+LASTS = 20
+"""Frames that something passes, or wheels slip (fifteen of them)."""
+_SIGMAS = 3.0  # of the stated deviation, within which an error is honest
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Frames of a drive, all in memory.
+
+    Attributes:
+        rig: the cameras as the run is told.
+        stamps: (n,) seconds.
+        images: (left, right) a frame.
+        odometry: of the body to each frame; None to the first.
+        truth: (n, 4, 4) poses of the right camera.
+        scale: distance of what is near, metres: where bodies pass.
+    """
+
+    rig: CameraRig
+    stamps: FloatArray
+    images: list[tuple[Image, Image]]
+    odometry: list[Odometry | None]
+    truth: FloatArray
+    scale: float
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def every(self, stride: int) -> Drive:
+        """Every so many frames of it, with odometry composed."""
+        kept = range(0, len(self), stride)
+        steps: list[Odometry | None] = [None]
+        for k in kept[1:]:
+            known = [one for one in self.odometry[k - stride + 1 : k + 1] if one is not None]
+            steps.append(compose_odometry(known))
+        images = [self.images[k] for k in kept]
+        return replace(self, stamps=self.stamps[::stride], images=images, odometry=steps,
+                       truth=self.truth[::stride])  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------
+# Rooms of textured rectangles
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """A textured rectangle: its pose (the texture in x and y), size and grey values a metre."""
+
+    wTb: FloatArray
+    size: tuple[float, float]
+    texture: FloatArray
+    texels: float = 60.0
+
+
+def texture(seed: int, size: tuple[float, float], period_m: float = 0.0) -> FloatArray:
+    """Grey values of a board of this size, metres; repeated along x where there is a period."""
+    width, height = (round(60.0 * side) for side in (period_m or size[0], size[1]))
+    noise = np.random.default_rng(seed).normal(size=(height, width))
+    levels = [ndimage.gaussian_filter(noise, s, mode="wrap") for s in (1.2, 3.0, 9.0)]
+    return np.asarray(128.0 + 28.0 * sum(one / one.std() for one in levels))
+
+
+def view(boards: Iterable[Board], rig: CameraRig, wTc: FloatArray, image: FloatArray) -> FloatArray:
+    """The image (h, w) with the boards that a camera sees from its pose in front of it."""
+    columns, rows = np.meshgrid(np.arange(rig.width), np.arange(rig.height))
+    rays = np.stack([(columns - rig.cx) / rig.fx, (rows - rig.cy) / rig.fy, np.ones(rows.shape)])
+    image, nearest = image.copy(), np.full(image.shape, np.inf)
+    for board in boards:
+        bTc = inverse(board.wTb) @ wTc
+        along = np.tensordot(bTc[:3, :3], rays, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = -bTc[2, 3] / along[2]
+            x, y = bTc[0, 3] + depth * along[0], bTc[1, 3] + depth * along[1]
+        seen = (depth > 0.05) & (depth < nearest)
+        seen &= (np.abs(x) < 0.5 * board.size[0]) & (np.abs(y) < 0.5 * board.size[1])
+        at = board.texels * np.stack([y[seen] + 0.5 * board.size[1], x[seen] + 0.5 * board.size[0]])
+        image[seen] = ndimage.map_coordinates(board.texture, at, order=1, mode="grid-wrap")
+        nearest[seen] = depth[seen]
+    return image
+
+
+def rendered(boards: list[Board], truth: FloatArray, seed: int = 0, scale: float = 1.5) -> Drive:
+    """A drive past boards, with odometry of 1 % and 0.2 degrees a step."""
+    rig = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, None, np.eye(4), exact=True)
+    rng, images = np.random.default_rng(seed), []
+    for wTc in truth:
+        pair = [
+            view(
+                boards,
+                rig,
+                wTc @ pose(np.eye(3), np.array([-x, 0.0, 0.0])),
+                np.full((240, 320), 90.0),
+            )
+            for x in (rig.baseline, 0.0)
+        ]
+        images.append(tuple(_grey(one + rng.normal(0.0, 1.5, one.shape)) for one in pair))
+    stamps = 0.5 * np.arange(len(truth))
+    return Drive(rig, stamps, images, _measured(truth, rig, seed), truth, scale)  # type: ignore[arg-type]
+
+
+def _grey(levels: FloatArray) -> Image:
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def _measured(truth: FloatArray, rig: CameraRig, seed: int) -> list[Odometry | None]:
+    """The body's motions with noise as stated."""
+    rng, out = np.random.default_rng([seed, 1]), [None]
+    for before, after in pairwise(truth):
+        motion = rig.bTc @ inverse(before) @ after @ inverse(rig.bTc)
+        covariance = _noise(motion)
+        drawn = rng.normal(size=6) * np.sqrt(np.diagonal(covariance))
+        out.append(Odometry(motion @ se3_exp(drawn), covariance))  # type: ignore[arg-type]
+    return out  # type: ignore[return-value]
+
+
+def _noise(motion: FloatArray) -> FloatArray:
+    length, turn = np.linalg.norm(motion[:3, 3]), rotation_angle(motion[:3, :3])
+    sigmas = [np.radians(0.2) + 0.01 * turn] * 3 + [0.001 + 0.01 * length] * 3
+    return np.diag(np.square(sigmas))
+
+
+def _level(x: FloatArray, z: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Poses (n, 4, 4) of a level camera, turned to the right by ``yaw``."""
+    return np.array([pose(so3_exp(np.array([0.0, t, 0.0])), np.array([a, 0.0, b]))
+                     for a, b, t in zip(x, z, yaw, strict=True)])  # fmt: skip
+
+
+def _walls(
+    places: Iterable[tuple[float, float, float]], width: float, period: float
+) -> list[Board]:
+    """Boards 3 m high at (x, z), facing into the direction that is turned by the third."""
+    out = []
+    for k, (x, z, yaw) in enumerate(places):
+        wTb = pose(so3_exp(np.array([0.0, yaw, 0.0])), np.array([x, 0.0, z]))
+        out.append(Board(wTb, (width, 3.0), texture(k, (width, 3.0), period)))
+    return out
+
+
+def _accelerating(n: int, step: float) -> FloatArray:
+    """(n,) way of a robot that starts, and drives faster and slower."""
+    return np.concatenate([[0.0], np.cumsum(step * (1.0 + 0.5 * np.sin(0.4 * np.arange(n - 1))))])
+
+
+def room(period: float = 0.0) -> Drive:
+    """Along a bend in a room of 8 by 8 m, whose walls repeat themselves after a period."""
+    angle = _accelerating(46, 0.045)
+    truth = _level(2.0 - 2.0 * np.cos(angle), 2.0 * np.sin(angle) - 1.0, angle)
+    quarter = np.pi / 2
+    return rendered(
+        _walls([(0, 4, 0), (4, 0, quarter), (0, -4, 2 * quarter), (-4, 0, -quarter)], 8.0, period),
+        truth,
+    )
+
+
+def periodic_wall() -> Drive:
+    """Sideways before a wall of equal columns."""
+    way = _accelerating(40, 0.3)
+    return rendered(_walls([(6.0, 3.0, 0.0)], 24.0, 0.3), _level(way, 0.0 * way, 0.0 * way))
+
+
+def equal_corridor() -> Drive:
+    """Along a corridor, 2.4 m wide, of equal parts, 1.5 m long."""
+    way, quarter = _accelerating(40, 0.6), np.pi / 2
+    sides = _walls([(-1.2, 15.0, -quarter), (1.2, 15.0, quarter)], 42.0, 1.5)
+    return rendered(sides, _level(0.0 * way, way, 0.02 * np.sin(way)))
+
+
+# ------------------------------------------------------------------------------------------
+# Recordings
+
+
+def lab(frames: int = 50) -> Drive:
+    """The paper's drive in the rendered lab, by two of its three cameras."""
+    return _recorded(
+        fg.open_recording(
+            "lab_loop", {"dataset.rig.vertical_baseline_m": "null", "dataset.stop": frames}
+        ),
+        1.2,
+    )
+
+
+def road(data: Path, frames: int = 50) -> Drive:
+    """The suburb, with measured odometry."""
+    return _recorded(fg.open_recording(data / "kitti_raw_0926_5hz", {"dataset.stop": frames}), 5.0)
+
+
+def drone(data: Path, frames: int = 50) -> Drive:
+    """The drone's key frames; odometry is made from the truth."""
+    return _recorded(fg.open_recording(data / "euroc_v101_kf100", {"dataset.stop": frames}), 1.2)
+
+
+def _recorded(recording: fg.Recording, scale: float) -> Drive:
+    frames = list(recording)
+    truth = recording.ground_truth
+    if truth is None or any(images is None for _, images, _ in frames):
+        raise ValueError(f"{recording.name}: every frame needs images and a true pose")
+    steps = [odometry for _, _, odometry in frames]
+    if steps[1] is None:
+        steps = _measured(truth.poses, recording.rig, 0)
+    images = [(one[0], one[1]) for _, one, _ in frames if one is not None]
+    return Drive(recording.rig, recording.timestamps, images, steps, truth.poses, scale)
+
+
+@cache
+def recordings(data: Path) -> dict[str, Callable[[], Drive]]:
+    """By name; each is read once."""
+    return {
+        "lab": cache(lab),
+        "road": cache(lambda: road(data)),
+        "drone": cache(lambda: drone(data)),
+        "room": cache(room),
+        "room of 4 m": cache(lambda: room(4.0)),
+        "wall": cache(periodic_wall),
+        "corridor": cache(equal_corridor),
+    }
+
+
+# ------------------------------------------------------------------------------------------
+# Faults
+
+Fault = Callable[[Drive], Drive]
+
+
+def wheels(scale: float, first: int = 1, frames: int = 1000) -> Fault:
+    """Wheels that report so many times their way, from a frame on; -1: the motion reversed."""
+
+    def wrong(step: Odometry) -> Odometry:
+        motion = step.motion.copy()
+        if scale < 0.0:
+            motion = inverse(motion)
+        elif scale == 0.0:
+            motion = np.eye(4)
+        else:
+            motion[:3, 3] *= scale
+        return Odometry(
+            motion, _noise(motion) if scale <= 0.0 else max(scale, 1.0) * step.covariance
+        )
+
+    def act(drive: Drive) -> Drive:
+        steps = [
+            wrong(step) if step and first <= k < first + frames else step
+            for k, step in enumerate(drive.odometry)
+        ]
+        return replace(drive, odometry=steps)
+
+    return act
+
+
+def images_of(change: Callable[[Drive, int], tuple[Image, Image]]) -> Fault:
+    """Other images from the frame on at which faults begin."""
+    return lambda drive: replace(drive, images=[
+        change(drive, k) if k >= BEGINS else pair for k, pair in enumerate(drive.images)
+    ])  # fmt: skip
+
+
+def turned(yaw: float, pitch: float, roll: float, drifts: bool = False) -> Fault:
+    """The left camera turned against the right one, degrees."""
+
+    def change(drive: Drive, k: int) -> tuple[Image, Image]:
+        share = (k - BEGINS) / (len(drive) - BEGINS) if drifts else 1.0
+        rig, (left, right) = drive.rig, drive.images[k]
+        camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+        warp = camera @ so3_exp(share * np.radians([pitch, yaw, roll])) @ np.linalg.inv(camera)
+        size = (left.shape[1], left.shape[0])
+        warped = cv2.warpPerspective(left, warp, size, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(warped, np.uint8), right
+
+    return images_of(change)
+
+
+def body(
+    speed: float,
+    width: float,
+    start: float,
+    height: float = 1.0,
+    lasts: int = 1000,
+    first: int = BEGINS,
+) -> Fault:
+    """A textured body before the camera.
+
+    Args:
+        speed: to the left, metres a second for what is 5 m away, less for what is nearer.
+        width: share of the view.
+        start: its left edge at first, share of the view from the left.
+        height: share of the view, from below.
+        lasts: frames.
+        first: frame.
+    """
+
+    def act(drive: Drive) -> Drive:
+        rig, z, period = drive.rig, drive.scale, float(np.median(np.diff(drive.stamps)))
+        across, down = z * rig.width / rig.fx, z * rig.height / rig.fy
+        size, images = (width * across, height * down), list(drive.images)
+        board = Board(np.eye(4), size, texture(77, size), 60.0)
+        pixels = 0.5 * rig.fx / z  # a texel is two pixels
+        grey = np.random.default_rng(5).normal(
+            size=(round(pixels * size[1]), round(pixels * size[0]))
+        )
+        grey = sum(ndimage.gaussian_filter(grey, s) / s for s in (0.8, 2.0, 6.0))
+        board = replace(
+            board, texture=128.0 + 30.0 * (grey - grey.mean()) / grey.std(), texels=pixels
+        )
+        for k in range(first, min(first + lasts, len(drive))):
+            x = (start - 0.5) * across + 0.5 * size[0] - speed * z / 5.0 * period * (k - first)
+            y = 0.5 * down - 0.5 * size[1]
+            placed = replace(board, wTb=pose(np.eye(3), np.array([x, y, z])))
+            pair = [
+                view(
+                    [placed], rig, pose(np.eye(3), np.array([-b, 0.0, 0.0])), one.astype(np.float64)
+                )
+                for b, one in zip((rig.baseline, 0.0), images[k], strict=True)
+            ]
+            noise = np.random.default_rng([k, 3]).normal(0.0, 1.0, pair[0].shape)
+            images[k] = _grey(pair[0] + noise), _grey(pair[1] + noise[::-1])
+        return replace(drive, images=images)
+
+    return act
+
+
+def train(drive: Drive) -> Drive:
+    """The robot stands for twenty frames, and something passes that fills the view."""
+    n, rng = len(drive), np.random.default_rng(8)
+    rows = np.clip(
+        np.arange(n + LASTS) - np.clip(np.arange(n + LASTS) - BEGINS, 0, LASTS), 0, n - 1
+    )
+    truth = drive.truth[rows]
+    stands = np.append(False, np.diff(rows) == 0)
+    images = [
+        tuple(
+            _grey(one + rng.normal(0.0, 1.5, one.shape)) if still else one
+            for one in drive.images[row]
+        )
+        for row, still in zip(rows.tolist(), stands, strict=True)
+    ]
+    steps = [
+        Odometry(se3_exp(rng.normal(size=6) * np.repeat([2e-4, 1e-3], 3)), _noise(np.eye(4)))
+        if still else drive.odometry[row]
+        for row, still in zip(rows.tolist(), stands, strict=True)
+    ]  # fmt: skip
+    stamps = drive.stamps[0] + np.median(np.diff(drive.stamps)) * np.arange(len(rows))
+    longer = Drive(drive.rig, stamps, images, steps, truth, drive.scale)  # type: ignore[arg-type]
+    return body(1.5, 6.0, -0.5, 1.2, LASTS - 4, BEGINS + 2)(longer)
+
+
+def off_centre(drive: Drive) -> Drive:
+    """A calibration whose principal point is off by eight pixels."""
+    return replace(drive, rig=replace(drive.rig, cx=drive.rig.cx + 8.0))
+
+
+def _darker(drive: Drive, k: int) -> tuple[Image, Image]:
+    left, right = drive.images[k]
+    return (left // 2).astype(np.uint8), right
+
+
+FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
+    "all cameras frozen": (images_of(lambda d, k: d.images[BEGINS]), ("road", "lab")),
+    "left one frozen": (
+        images_of(lambda d, k: (d.images[BEGINS][0], d.images[k][1])),
+        ("road", "lab"),
+    ),
+    "left one late": (
+        images_of(lambda d, k: (d.images[k - 1][0], d.images[k][1])),
+        ("road", "lab"),
+    ),
+    "left one darker": (images_of(_darker), ("road", "lab")),
+    "hood over a third": (body(0.0, 1.0, 0.0, 0.34, first=0), ("lab", "road", "drone")),
+    "hood over half": (body(0.0, 1.0, 0.0, 0.5, first=0), ("lab", "road", "drone")),
+    "bus, walking pace": (body(1.4, 0.75, 0.4, 0.9, LASTS), ("lab", "road", "drone")),
+    "bus, fast": (body(5.6, 2.0, 0.4, 0.9, LASTS), ("lab", "road", "drone")),
+    "train, robot stands": (train, ("lab", "room")),
+    "shelf carried along": (body(0.0, 0.7, 0.15, 0.9, LASTS), ("lab", "room", "road")),
+    "periodic wall": (lambda drive: drive, ("wall",)),
+    "equal corridor": (lambda drive: drive, ("corridor",)),
+    "wheels slip x 10": (wheels(10.0, BEGINS, 15), ("lab", "room", "road", "drone")),
+    "wheels slip throughout": (wheels(10.0), ("lab", "room")),
+    "wheels stuck": (wheels(0.0, BEGINS), ("lab", "room", "road")),
+    "wheels x 1.5": (wheels(1.5), ("lab", "room", "road")),
+    "wheels reversed": (wheels(-1.0), ("lab", "room of 4 m", "road")),
+    "yaw knocked 0.25": (turned(0.25, 0.0, 0.0), ("road", "lab")),
+    "yaw drifts 0.4": (turned(0.4, 0.0, 0.0, drifts=True), ("road", "lab")),
+    "pitch, roll 0.3": (turned(0.0, 0.3, 0.3), ("road", "lab")),
+    "principal point 8 px": (off_centre, ("road", "lab")),
+}
+"""Faults, and the recordings that each is tried on."""
+
+SOUND = dict.fromkeys(("lab", "road", "drone"), (1, 2, 3, 4, 5, 6)) | {
+    "room": (1, 2), "room of 4 m": (1, 2)
+}  # fmt: skip
+"""Strides of sound recordings."""
+
+
+# ------------------------------------------------------------------------------------------
+# What the default live run makes of a drive
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: its end error and stated deviation, metres; what it says of itself."""
+
+    error_m: float
+    sigma_m: float
+    statuses: Mapping[str, int]
+    causes: tuple[str, ...]
+    exits: int
+
+    @property
+    def sigmas(self) -> float:
+        """The error over its stated deviation."""
+        return self.error_m / max(self.sigma_m, 1e-9)
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """Of a table's row."""
+        usual = ("first", "ok")
+        odd = ", ".join(
+            f"{n} {name}" for name, n in sorted(self.statuses.items()) if name not in usual
+        )
+        told = "; ".join(self.causes)
+        return (self.error_m, self.sigma_m, self.sigmas, odd, told, self.exits,
+                "yes" if self.sigmas <= _SIGMAS or told else "NO")  # fmt: skip
+
+
+def outcome(drive: Drive) -> Outcome:
+    """Pushes the frames, as `fgslam run` does, and reads what it states at its end."""
+    with Session(drive.rig) as slam:
+        for t, images, odometry in zip(drive.stamps, drive.images, drive.odometry, strict=True):
+            slam.track(float(t), images, odometry)
+        found, enough = slam.result(), located(slam.recorder, slam.pipeline.tracker.parts).enough
+    last = found.trajectory.poses[-1]
+    n = len(drive) - len(found.trajectory.poses)
+    true = inverse(drive.truth[n]) @ drive.truth[-1]
+    sigma = float(np.sqrt(np.trace(found.covariances[-1][3:, 3:])))
+    error = float(np.linalg.norm((inverse(found.trajectory.poses[0]) @ last)[:3, 3] - true[:3, 3]))
+    causes = tuple(
+        one.code if isinstance(one, Remark) else sentence(one)[:60] for one in found.remarks
+    )
+    statuses = Counter(str(status) for status in found.column("status"))
+    return Outcome(error, sigma, statuses, causes, 0 if enough else 3)
+
+
+_COLUMNS = ("error m", "sigma m", "error/sigma", "status", "cause", "exit", "honest")
+
+
+def tables(data: Path) -> list[Table]:
+    """Each fault on its recordings; sound recordings at several strides."""
+    known, rows = recordings(data), []
+    for fault, (act, names) in FAULTS.items():
+        for name in names:
+            say(f"{fault}: {name}")
+            rows.append((fault, name, *outcome(act(known[name]())).cells))
+    faults = Table("Faults of images, odometry and rig", ("fault", "recording", *_COLUMNS), rows)
+    rows = []
+    for name, strides in SOUND.items():
+        for stride in strides:
+            say(f"sound: {name}, stride {stride}")
+            rows.append((name, stride, *outcome(known[name]().every(stride)).cells))
+    return [faults, Table("Sound recordings", ("recording", "stride", *_COLUMNS), rows)]
