@@ -20,7 +20,7 @@ from fgslam.cameras.formats import rgbd_part
 from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import View, pixel_grid, sampling_maps
 from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
-from fgslam.cameras.trees import read_tree
+from fgslam.cameras.trees import intrinsic_matrix, read_tree
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
@@ -432,11 +432,12 @@ def sample_depths(
 
 
 _TUM_CAMERAS = {
-    "1": (517.3, 516.5, 318.6, 255.3),
-    "2": (520.9, 521.0, 325.1, 249.7),
-    "3": (535.4, 539.2, 320.1, 247.6),
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
-"""fx, fy, cx, cy of the colour cameras, as TUM publishes them; their distortion is left out."""
+"""fx, fy, cx, cy and k1, k2, p1, p2, k3 of the colour cameras, as TUM publishes them; images of the
+third are without distortion."""
 
 
 _OF_COLOUR = re.compile(r"rgb|colou?r", re.IGNORECASE)
@@ -502,10 +503,16 @@ def _camera(
             f"{root}: nothing states the colour camera's focal length; give its calibration by "
             "--camera FILE"
         )
-    fx, fy, cx, cy = _TUM_CAMERAS[known[1]]
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    camera = RawCamera(*size, matrix, np.zeros(4), np.eye(4), f"freiburg{known[1]}")
-    return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
+    intrinsics, distortion = _TUM_CAMERAS[known[1]]
+    matrix, name = intrinsic_matrix(*intrinsics), f"freiburg{known[1]}"
+    camera = RawCamera(*size, matrix, np.array(distortion or np.zeros(4)), np.eye(4), name)
+    numbers = ", ".join(f"{value:g}" for value in distortion)
+    taken = (
+        f"its distortion k1, k2, p1, p2, k3 = {numbers} is taken away"
+        if numbers
+        else "of no distortion"
+    )
+    return camera, (f"the camera is taken as TUM's {name}, by the folder's name; {taken}",)
 
 
 def _own_files(root: Path) -> list[Path]:

@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from fgslam.backend.protocol import Estimator, FullEstimator, MapUser
 from fgslam.backend.settings import ESTIMATORS, EstimatorSettings, FloorMode
 from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.correction import term_names
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
@@ -82,7 +83,7 @@ def make_pipeline(
     estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
     measured_odometry = not isinstance(odometry, ConstantVelocitySettings)
     require_support(estimator, measured_odometry, loops=frontend.loops)
-    tracker = make_tracker(rig, frontend)
+    tracker, of_depth = make_tracker(rig, frontend), has_depth_camera(frontend)
     if arrival is not None:
         take_over(estimator, arrival)
         tracker.database.load(arrival.saved)
@@ -97,7 +98,8 @@ def make_pipeline(
         ),
         calibration=make_calibration(rig, frontend),
         key_frames=make_key_frames(rig, frontend, tracker),
-        watch=CameraWatch(rig) if frontend.watch_cameras else None,
+        stated=np.zeros(len(term_names(rig))) if of_depth else None,
+        watch=CameraWatch(rig) if frontend.watch_cameras and not of_depth else None,
         located=prior if arrival is not None and arrival.relocalised else None,
     )
 
@@ -295,7 +297,13 @@ def calibrates_itself(settings: FrontendSettings) -> bool:
 
     The paper's measurement is not the least squares over all images that a correction changes.
     """
-    return settings.self_calibration and settings.stereo.measurement == "fused"
+    fused = settings.stereo.measurement == "fused"
+    return settings.self_calibration and fused and not has_depth_camera(settings)
+
+
+def has_depth_camera(settings: FrontendSettings) -> bool:
+    """Whether the left camera is made up from depth: one that cannot have moved, or be late."""
+    return settings.stereo.disparity_sigma_px is not None
 
 
 def make_key_frames(

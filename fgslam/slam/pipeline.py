@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
-from fgslam.core.arrays import IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import RigCorrection
 from fgslam.core.sensors import Increment, LoopClosure, Odometry
 from fgslam.core.stopwatch import Stopwatch, timed
@@ -52,6 +52,8 @@ class SlamPipeline:
     Attributes:
         places: None where none are recognised.
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
+        stated: (p,) zeros, the correction of a rig that no drive corrects but that is not exact: of
+            a depth camera scale and lens are unknown; None: it is taken as exact.
         key_frames: tracking between key frames; None where every frame is one.
         watch: which frames' images cannot be used; None uses all.
         witnesses: decides between images and odometry where they contradict each other.
@@ -72,6 +74,7 @@ class SlamPipeline:
     estimator: Estimator
     places: PlaceRecognition | None = None
     calibration: SelfCalibration | None = None
+    stated: FloatArray | None = None
     key_frames: KeyFrameTracker | None = None
     watch: CameraWatch | None = None
     located: Prediction | None = None
@@ -295,7 +298,7 @@ class SlamPipeline:
             pruned_ids=association.pruned_ids,
             loops=matched.loops,
             relocalised=matched.relocalised,
-            rig_correction=None if calibration is None else calibration.found.applied.values,
+            rig_correction=self.stated if calibration is None else calibration.found.applied.values,
             settled_rig=None if calibration is None else calibration.settled,
         )
 

@@ -231,7 +231,12 @@ def test_depth_is_found_again_as_the_disparity_that_it_says(shared_data: Path) -
     assert len(found) > 200
     file = sorted((shared_data / "rgbd_fr1" / "depth").iterdir())[0]
     depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / 5000.0
-    columns, rows = np.rint(found.measurement[:, :2]).astype(int).T
+    rig, lens = recording.rig, np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
+    matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+    pixels = np.column_stack([found.measurement[:, :2], np.ones(len(found))])
+    rays, none = pixels @ np.linalg.inv(matrix).T, np.zeros(3)
+    places = cv2.projectPoints(rays, none, none, matrix, lens)[0].reshape(-1, 2)
+    columns, rows = np.rint(places).astype(int).clip(0, [639, 479]).T  # of the stored images
     stored = depth[rows, columns]
     known = stored > 0.0
     expected = recording.rig.fx * recording.rig.baseline / stored[known]

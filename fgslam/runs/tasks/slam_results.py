@@ -485,8 +485,8 @@ def require_self_calibration(config: Experiment) -> None:
     measured = slam is not None and isinstance(slam.dataset, MeasurementDatasetSettings)
     if slam is None or measured or not calibrates_itself(slam.frontend):
         raise ConfigError(
-            "--camera-out: this run takes its cameras as calibrated; it needs SLAM on images with "
-            "frontend.self_calibration true and stereo.measurement fused"
+            "--camera-out: this run takes its cameras as calibrated; it needs images of two or "
+            "three cameras, frontend.self_calibration true and stereo.measurement fused"
         )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from dataset_builders import HEIGHT, WIDTH, picture, save
 
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.depth import BASELINE_M, seen_from_the_left
@@ -258,6 +259,45 @@ def test_the_colour_camera(tmp_path: Path) -> None:
     camera(root, width=640, height=480)
     with pytest.raises(CalibrationError, match="is for images of 640x480 pixels, the images have"):
         opened(root)
+
+
+def centre_of(image: Image) -> list[float]:
+    """Column and row of a bright dot, by its brightness."""
+    rows, columns = np.indices(image.shape)
+    return [float(np.average(places, weights=image)) for places in (columns, rows)]
+
+
+@pytest.mark.parametrize(
+    ("name", "distortion"),
+    [
+        ("rgbd_dataset_freiburg1_rpy", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+        ("fr2_desk", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+        ("freiburg3_office", ()),
+    ],
+)
+def test_the_distortion_of_tums_cameras_is_taken_away(
+    tmp_path: Path, name: str, distortion: tuple[float, ...]
+) -> None:
+    """A dot far from the middle appears where OpenCV finds that an exact lens shows it."""
+    root, dot = tum(tmp_path / name), (560, 400)
+    (root / "calib.json").unlink()
+    for path in [*root.glob("rgb/*.png"), *root.glob("depth/*.png")]:
+        image = np.full((480, 640), round(5000 * DEPTH_M), np.uint16)
+        if path.parent.name == "rgb":
+            image = cv2.circle(np.zeros((480, 640, 3), np.uint8), dot, 4, (255, 255, 255), -1)
+        save(path, image)
+    recording = opened(root)
+    rig = recording.rig
+    matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+    lens = np.array(distortion or np.zeros(5))
+    expected = cv2.undistortPoints(np.array([[dot]], np.float64), matrix, lens, P=matrix).ravel()
+    right, left = recording.frame(0).images
+    assert centre_of(right) == pytest.approx(expected.tolist(), abs=0.2)
+    assert (np.hypot(*(expected - dot)) > 3.0) == bool(distortion)
+    shifted = expected + np.array([rig.fx * BASELINE_M / DEPTH_M, 0.0])
+    assert centre_of(left) == pytest.approx(shifted.tolist(), abs=0.2)
+    (stated,) = (note for note in recording.notes if "the camera is taken as TUM's" in note)
+    assert ("k1, k2, p1, p2, k3 = 0.2" in stated) == bool(distortion)
 
 
 def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
