@@ -138,7 +138,9 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         read, rig = partial(read_ply, folder / "map.ply"), lambda: log().rig
     lines = [f"note: {remark}"] if remark else []
     if wanted.trajectory is not None:
-        lines.append(_save(wanted.trajectory, wanted, trajectory, folder, rig, remark))
+        saved_as = _save(wanted.trajectory, wanted, trajectory, folder, rig, remark)
+        bare = folder is not None and wanted.trajectory.suffix.lower() == ".kitti"
+        lines.append(saved_as + (line_numbers(trajectory, log()) if bare else ""))
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines
     points = read()
@@ -155,6 +157,22 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         write_map(wanted.map, points, remark, wanted.chosen_axes)
         lines.append(f"{wanted.map}: {len(points)} landmarks")
     return lines
+
+
+def line_numbers(trajectory: Trajectory, log: MeasurementLog) -> str:
+    """Which frame each line of KITTI's format is, which has no times; empty where line k is k."""
+    rows = np.searchsorted(log.timestamps, trajectory.timestamps - _ROUNDING_S)
+    numbers = np.array([increment.index for increment in log.increments])[rows]
+    if np.array_equal(numbers, np.arange(len(numbers))):
+        return ""
+    some = ", ".join(map(str, numbers[:4])) + (", ..." if len(numbers) > 4 else "")
+    return (
+        f"; the format has no times: lines 0, 1, ... are frames {some} to {numbers[-1]} of the "
+        "recording (a .tum has times)"
+    )
+
+
+_ROUNDING_S = 5e-7  # of stamps in trajectories
 
 
 def sources_of(run: Path) -> tuple[Path, ...]:
