@@ -25,6 +25,8 @@ from fgslam.evaluation.statistics import (
     Nees,
     TimeGrowth,
     UpdateTime,
+    associate,
+    best_aligned,
     end_pose,
     estimate_from_truth,
     evaluate_trajectory,
@@ -39,6 +41,7 @@ from fgslam.evaluation.statistics import (
     within,
 )
 from fgslam.evaluation.statistics import nees as normalised
+from fgslam.evaluation.truth import sound_truth
 
 if TYPE_CHECKING:
     import pandas
@@ -189,13 +192,18 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     """
     final = truth.of_same_frame(answer.estimate.trajectory)
     online = truth.of_same_frame(answer.online)
+    sound = sound_truth(final, truth.trajectory)
     aligned = evaluate_trajectory(final, truth.trajectory, Alignment.SE3)
-    first = evaluate_trajectory(final, truth.trajectory, Alignment.FIRST_POSE)
-    of_camera = truth.of_camera()
+    first = evaluate_trajectory(final, sound.trajectory, Alignment.FIRST_POSE)
+    of_camera = replace(truth, trajectory=sound.trajectory).of_camera()
     errors = _landmark_errors(answer.estimate, of_camera)
     estimate = answer.estimate
     final_errors = _pose_errors(estimate.trajectory, estimate.covariances, of_camera)
     online_errors = _pose_errors(answer.online, answer.online_covariances, of_camera)
+    best = (
+        _pose_errors(estimate.trajectory, estimate.covariances, of_camera, best=True),
+        _pose_errors(answer.online, answer.online_covariances, of_camera, best=True),
+    )
     nees = {
         "pose": normalised(*final_errors),
         "online_pose": normalised(*online_errors),
@@ -225,9 +233,14 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "path_length_m": aligned.path_length_m,
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
+            "nees_best": _as_json(judge([normalised(*best[0])])),
+            "nees_relative": _relative(estimate, of_camera.trajectory),
             "coverage": _coverage(*final_errors),
-            "online": _online(online, truth, judged["online_pose"])
-            | {"coverage": _coverage(*online_errors)},
+            "online": _online(online, truth.trajectory, sound.trajectory, judged["online_pose"])
+            | {
+                "coverage": _coverage(*online_errors),
+                "nees_best": _as_json(judge([normalised(*best[1])])),
+            },
             "landmark_rmse_m": None if errors is None else errors.rmse_m,
             "landmark_median_m": None if errors is None else errors.median_m,
             "landmarks_with_truth": None if errors is None else len(errors),
@@ -238,7 +251,9 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             # Se et al. (5) measure by it how well a loop closes.
             "end_against_start": _as_json(end_pose(answer.estimate.trajectory)),
             "noise_factor": answer.estimate.noise_factor,
-            "remarks": list(answer.estimate.remarks),
+            "remarks": [*answer.estimate.remarks, *filter(None, [sound.why])],
+            "judged_poses": first.matched_poses,
+            "truth_left_out": sound.left_out.tolist(),
         },
     )
     return Judgement(metrics, nees)
@@ -304,18 +319,38 @@ def _as_json(found: Consistency | TimeGrowth | EndPose | None) -> JsonValue:
 
 
 def _pose_errors(
-    trajectory: Trajectory, covariances: FloatArray, truth: Truth
+    trajectory: Trajectory, covariances: FloatArray, truth: Truth, best: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Errors (k, 6) and covariances (k, 6, 6) of all poses with a truth, but the first of them.
 
-    It is aligned, and the gauge has neither error nor covariance.
+    It is aligned, and the gauge has neither error nor covariance. Or where they are the ``best``.
     """
     known = truth.trajectory
     found = None if known is None else to_estimate_world(trajectory, known)
     if found is None:
         return np.empty((0, 6)), np.empty((0, 6, 6))
     rows, poses = found[0][1:], found[1][1:]
+    if best:
+        poses = best_aligned(trajectory.poses[rows], covariances[rows], poses)
     return pose_errors(trajectory.poses[rows], poses), covariances[rows]
+
+
+def _relative(estimate: Estimate, truth: Trajectory | None) -> dict[str, JsonValue]:
+    """NEES of the motions over so many frames, both ends of which have a truth, by their number."""
+    if truth is None:
+        return {}
+    rows, true_rows = associate(estimate.trajectory.timestamps, truth.timestamps)
+    true = np.full((len(estimate.trajectory), 4, 4), np.nan)
+    true[rows] = truth.poses[true_rows]
+    out: dict[str, JsonValue] = {}
+    for lag, covariances in estimate.relative.items():
+        known = np.isfinite(true[lag:]).all(axis=(1, 2)) & np.isfinite(true[:-lag]).all(axis=(1, 2))
+        known &= np.isfinite(covariances).all(axis=(1, 2))
+        at, poses = np.flatnonzero(known), estimate.trajectory.poses
+        motions = inverse(poses[at]) @ poses[at + lag]
+        errors = pose_errors(motions, inverse(true[at]) @ true[at + lag])
+        out[str(lag)] = _as_json(judge([normalised(errors, covariances[at])]))
+    return out
 
 
 def _coverage(errors: FloatArray, covariances: FloatArray) -> JsonValue:
@@ -334,10 +369,12 @@ def _landmark_errors(estimate: Estimate, truth: Truth) -> LandmarkErrors | None:
     return None if eTt is None else landmark_errors(estimate.landmarks, truth.landmarks, eTt)
 
 
-def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> dict[str, JsonValue]:
+def _online(
+    online: Trajectory, truth: Trajectory | None, sound: Trajectory | None, nees: Consistency | None
+) -> dict[str, JsonValue]:
     """The same errors of the poses as they were first estimated."""
-    aligned = evaluate_trajectory(online, truth.trajectory, Alignment.SE3)
-    first = evaluate_trajectory(online, truth.trajectory, Alignment.FIRST_POSE)
+    aligned = evaluate_trajectory(online, truth, Alignment.SE3)
+    first = evaluate_trajectory(online, sound, Alignment.FIRST_POSE)
     return {
         "ate_rmse_m": aligned.ate_rmse_m,
         "ate_first_pose_m": first.ate_rmse_m,

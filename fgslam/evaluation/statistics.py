@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile
-from fgslam.core.geometry import inverse, pose, se3_log, yaw_pitch_roll
+from fgslam.core.geometry import adjoint, inverse, pose, se3_exp, se3_log, yaw_pitch_roll
 from fgslam.core.types import Trajectory
 
 SAME_TIME_S = 0.01
@@ -41,7 +41,8 @@ class TrajectoryError:
         rpe_rot_deg: the same of the rotation angle.
         path_length_m: length of the true path over the matched poses.
         drift_percent: ``end_error_m`` over ``path_length_m``, in percent.
-        end_error_m: distance of the last pose from the true one, with the *first* pose aligned.
+        end_error_m: distance of the last pose from the true one, with the *first* pose aligned;
+            None where the last pose has no truth.
         end_error_deg: angle between the last orientation and the true one, first pose aligned.
     """
 
@@ -229,9 +230,12 @@ def evaluate_trajectory(
     aligned = None if tTe is None else moved(tTe, estimated)
     ate = None if aligned is None else position_errors(aligned, true)
     steps = None if aligned is None or len(rows) < 2 else relative_errors(aligned, true)
-    # A drift is measured from the start: with the first pose aligned.
-    end = inverse(inverse(true[0]) @ true[-1]) @ inverse(estimated[0]) @ estimated[-1]
-    end_m = float(np.linalg.norm(end[:3, 3]))
+    # A drift is measured from the start to the end: with the first pose aligned.
+    end_m = end_deg = None
+    if rows[-1] == len(estimate) - 1:
+        end = inverse(inverse(true[0]) @ true[-1]) @ inverse(estimated[0]) @ estimated[-1]
+        end_m = float(np.linalg.norm(end[:3, 3]))
+        end_deg = float(np.degrees(rotation_angles(end[None, :3, :3])[0]))
     length = path_length(true)
     return TrajectoryError(
         alignment=alignment,
@@ -241,9 +245,9 @@ def evaluate_trajectory(
         rpe_trans_m=None if steps is None else _rmse(steps[0]),
         rpe_rot_deg=None if steps is None else float(np.degrees(_rmse(steps[1]))),
         path_length_m=length,
-        drift_percent=100.0 * end_m / length if length > 0.0 else None,
+        drift_percent=100.0 * end_m / length if end_m is not None and length > 0.0 else None,
         end_error_m=end_m,
-        end_error_deg=float(np.degrees(rotation_angles(end[None, :3, :3])[0])),
+        end_error_deg=end_deg,
     )
 
 
@@ -384,6 +388,33 @@ def pose_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:
     """
     relative = inverse(estimate) @ truth
     return np.array([se3_log(motion) for motion in relative]).reshape(-1, 6)
+
+
+_ROUNDS = 20  # of Gauss-Newton for the best alignment
+_SETTLED = 1e-9  # radians and metres
+
+
+def best_aligned(estimate: FloatArray, covariances: FloatArray, truth: FloatArray) -> FloatArray:
+    """True poses (n, 4, 4) where their NEES against the estimates is least: weighted least squares.
+
+    Args:
+        estimate: (n, 4, 4) poses ``wTc``.
+        covariances: (n, 6, 6) in the tangent space at them; exact and unknown ones pull nothing.
+        truth: (n, 4, 4) true poses of the same instants, nearly in the estimates' world.
+    """
+    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    found = np.where(known[:, None, None], covariances, 0.0)
+    weights = np.linalg.pinv(found, rcond=_RELATIVE_RANK_TOLERANCE, hermitian=True)
+    by_world = adjoint(inverse(estimate))  # of a motion of the truth's world, at each pose
+    pull = np.swapaxes(by_world, 1, 2) @ weights
+    inverse_information = np.linalg.pinv((pull @ by_world).sum(axis=0), hermitian=True)
+    for _ in range(_ROUNDS):
+        errors = pose_errors(estimate, truth)
+        step = -inverse_information @ np.einsum("nij,nj->i", pull, errors)
+        truth = se3_exp(step) @ truth
+        if np.abs(step).max() < _SETTLED:
+            break
+    return truth
 
 
 def pose_nees(estimate: FloatArray, covariances: FloatArray, truth: FloatArray) -> Nees:

@@ -191,6 +191,7 @@ def headline(data: ReportData) -> tuple[str, ...]:
     lines = [*data.alarms]
     lines += [_accuracy(data, working)] if working else ["No estimator gave a result."]
     lines += _consistency(working)
+    lines += dict.fromkeys(f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark)
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     return tuple(lines)
 
@@ -202,10 +203,12 @@ def metres(value: float) -> str:
 
 def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
     ranked = sorted((e.ate_m, e.title) for e in working if e.ate_m is not None)
+    counts = sorted({e.matched_poses for e in working if e.ate_m is not None})
     if not ranked:
         why = "there is no ground truth" if data.truth is None else "too few poses have a truth"
         return f"How accurate the path is, is not known: {why}."
-    how = f"root mean square position error, {data.alignment}"
+    poses = " or ".join(f"{count:,}" for count in counts)
+    how = f"root mean square position error of {poses} poses, {data.alignment}"
     first, title = ranked[0]
     if len(ranked) == 1:
         return f"{title} is off by {metres(first)} ({how})."
@@ -224,7 +227,9 @@ def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
     for word, meaning in _JUDGED.items():
         found = [e for e in working if e.verdict == word]
         if found:
-            names = [f"{e.title} ({_nees(e.nees_per_dof)})" for e in found]
+            names = [
+                f"{e.title} ({_nees(e.nees_per_dof)} of {e.judged_poses:,} poses)" for e in found
+            ]
             yield f"{word.capitalize()} ({meaning}): {_listed(names)}."
     unknown = [e.title for e in working if e.verdict not in _JUDGED]
     if unknown:

@@ -22,6 +22,7 @@ from fgslam.evaluation.statistics import (
     position_errors,
     to_estimate_world,
 )
+from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import Picture, TextTable
 
 NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
@@ -44,6 +45,8 @@ class EstimatorReport:
         nees_band: interval that holds 95 % of a consistent estimator's values, or None.
         update_ms: (n,) milliseconds a frame; NaN where not timed.
         ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` states.
+        matched_poses: of how many poses; judged_poses: and NEES.
+        truth_remark: which true poses are left out of all but the first, and why.
         nees_per_dof: mean NEES of the run per degree of freedom.
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
@@ -68,6 +71,9 @@ class EstimatorReport:
     predicted: BoolArray
     nees_band: tuple[float, float] | None = None
     ate_m: float | None = None
+    matched_poses: int = 0
+    judged_poses: int = 0
+    truth_remark: str = ""
     nees_per_dof: float | None = None
     verdict: str | None = None
     remarks: tuple[str, ...] = ()
@@ -212,7 +218,10 @@ def judged_report(
         poses = report.online_poses.copy()
         poses[rows] = online.poses[of]
         report = replace(report, online_poses=poses)
-    found = None if truth is None else to_estimate_world(final, truth)
+    sound = sound_truth(final, truth)
+    known = sound.trajectory
+    found = None if known is None else to_estimate_world(final, known)
+    report = replace(report, truth_remark=sound.why)
     return report if found is None else _against_truth(report, *found, truth)
 
 
@@ -239,6 +248,8 @@ def _against_truth(
         nees=values,
         nees_band=chi_square_band(float(usual.argmax())) if len(usual) else None,
         ate_m=aligned.ate_rmse_m,
+        matched_poses=aligned.matched_poses,
+        judged_poses=len(later),
         nees_per_dof=None if judged is None else judged.per_dof,
         verdict=None if judged is None else judged.verdict,
     )
@@ -247,13 +258,13 @@ def _against_truth(
 def truth_in_their_world(
     estimators: tuple[EstimatorReport, ...], truth: Trajectory | None
 ) -> Trajectory | None:
-    """True poses of the frames, the first one aligned; of the estimator that has most of them."""
+    """Sound true poses of the frames, the first one aligned, of the estimator with most of them."""
     best: Trajectory | None = None
     for estimator in estimators:
-        if truth is None:
-            break
         final = estimator.final
-        found = to_estimate_world(final, truth)
+        if (sound := sound_truth(final, truth).trajectory) is None:
+            break
+        found = to_estimate_world(final, sound)
         if found is not None and (best is None or len(found[0]) > len(best)):
             best = Trajectory(final.timestamps[found[0]], found[1])
     return best

@@ -645,6 +645,10 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     end = "unknown"
     if metrics.end_error_m is not None and len(recorder) > 1:
         end = f"{_metres(metrics.end_error_m)}, {_number('{:.3f} deg', metrics.end_error_deg)}"
+
+    def poses(count: object) -> str:
+        return f", {count} poses" if count else ""
+
     rpe = f"{_metres(metrics.rpe_trans_m)}, {_number('{:.3f} deg', metrics.rpe_rot_deg)}"
     rows = {
         "frames": f"{len(recorder)} of {outputs.frames}",
@@ -654,9 +658,9 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         "landmarks matched, median (5 %)": "none"
         if matches is None
         else f"{matches['median']:.0f} ({matches['p05']:.0f})",
-        "ATE rms, SE3 aligned": _metres(metrics.ate_rmse_m),
-        "RPE a frame": rpe,
-        "end error, first pose aligned": end,
+        "ATE rms, SE3 aligned": f"{_metres(metrics.ate_rmse_m)}{poses(more.get('matched_poses'))}",
+        "RPE a frame": f"{rpe}{poses(more.get('matched_poses'))}",
+        "end error, first pose aligned": f"{end}{poses(more.get('judged_poses'))}",
         "end against start": "unknown",
         "drift": _number("{:.2f} %", metrics.drift_percent),
         "pose NEES per dof": "unknown",
@@ -670,7 +674,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
             "yaw {yaw_deg:.2f}, pitch {pitch_deg:.2f}, roll {roll_deg:.2f} deg".format(**known)
         )
     if isinstance(nees, dict):
-        band = f"(band {nees['lower']:.2f}-{nees['upper']:.2f})"
+        band = f"(band {nees['lower']:.2f}-{nees['upper']:.2f}){poses(nees['items'])}"
         rows["pose NEES per dof"] = f"{nees['per_dof']:.1f}: {nees['verdict']} {band}"
     if isinstance(bias, dict):
         pairs = zip(bias["rates"], bias["sigmas"], strict=True)

@@ -22,13 +22,16 @@ from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.judging import (
     COLUMNS,
     Answer,
+    Truth,
     compare,
+    judge_answer,
     judge_closures,
+    judge_replay,
     landmark_errors,
     mean_interval,
     paired_test,
 )
-from fgslam.evaluation.statistics import estimate_from_truth, time_growth
+from fgslam.evaluation.statistics import estimate_from_truth, pose_nees, time_growth
 from fgslam.runs.library import replay
 from fgslam.runs.report import LOOPS_FILE, closures_of, place_numbers, read_closures, write_closures
 from fgslam.slam.results import RunRecorder
@@ -126,6 +129,46 @@ def test_truth_of_another_frame_is_judged_as_its_own_tools_do(tmp_path: Path) ->
         ConfigError, match=r"the truth is wTl: pose of the left camera.*give the rig"
     ):
         compare({"a": found}, truth)
+
+
+def test_verdicts_leave_out_a_truth_that_settles() -> None:
+    """The first poses' truth is turned by 2 degrees: judged from there all else would be wrong."""
+    found, true = estimate(0.0), loop(40)
+    poses = true.poses.copy()
+    poses[:4] = poses[:4] @ se3_exp(np.array([0.0, np.radians(2.0), 0.0, 0.0, 0.0, 0.0]))
+    answer = with_times(found, np.ones(40))
+    judged = judge_answer(answer, Truth(Trajectory(true.timestamps, poses))).metrics
+    assert judged.more["truth_left_out"] == [0, 1, 2, 3]
+    assert (judged.more["matched_poses"], judged.more["judged_poses"]) == (40, 36)
+    assert judged.nees_pose_per_dof == pytest.approx(0.0, abs=1e-9)
+    assert judged.end_error_m == pytest.approx(0.0, abs=1e-9)
+    assert "truth of frames 0 to 3 is off by 2.0 degrees" in judged.more["remarks"][-1]
+
+
+@pytest.mark.parametrize("kind", ["odometry", "landmark_kalman", "batch"])
+def test_motions_err_as_the_joint_covariances_of_both_poses_say(kind: str) -> None:
+    drive = Drive(frames=24, points=70)
+    simulated = simulate(drive, np.random.default_rng(5))
+    log = MeasurementLog(RIG, {"kind": "recorded"}, simulated.increments)
+    truth = Truth(Trajectory(log.timestamps, np.array(simulated.poses)))
+    relative = judge_replay(replay(log, kind), truth).metrics.more["nees_relative"]
+    assert set(relative) == {"1", "5", "20"}
+    assert [relative[lag]["items"] for lag in ("1", "5", "20")] == [23, 19, 4]
+    for lag in ("1", "5"):
+        assert 0.5 < relative[lag]["per_dof"] < 2.0
+
+
+def test_motions_of_the_left_camera_have_the_same_nees() -> None:
+    simulated = simulate(Drive(frames=8, points=70), np.random.default_rng(5))
+    log = MeasurementLog(RIG, {"kind": "recorded"}, simulated.increments)
+    right, true = replay(log, "odometry").estimate, np.array(simulated.poses)
+    left, left_true = right.of("left", RIG), Trajectory(log.timestamps, true).of("left", RIG).poses
+    values = [
+        pose_nees(inverse(p[:-5]) @ p[5:], one.relative[5], inverse(t[:-5]) @ t[5:]).values
+        for one, t in ((right, true), (left, left_true))
+        for p in (one.trajectory.poses,)
+    ]
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
 
 
 def evo_ape(folder: Path, name: str) -> float:

@@ -12,6 +12,7 @@ from fgslam.evaluation.statistics import (
     Alignment,
     Nees,
     associate,
+    best_aligned,
     end_pose,
     evaluate_trajectory,
     judge,
@@ -302,3 +303,33 @@ def test_an_axis_that_leans_out_of_a_constraint_by_rounding_is_not_judged() -> N
     covariances = np.tile(basis @ np.diag([1.0, 0.25]) @ basis.T, (4, 1, 1))
     errors = np.tile([0.5, 0.5, 1e-3], (4, 1))
     np.testing.assert_equal(within(errors, covariances), [1.0, 1.0, np.nan])
+
+
+def test_without_the_last_poses_truth_there_is_no_end_error() -> None:
+    truth = wandering(1)
+    estimate = disturbed(truth, 2)
+    known = Trajectory(truth.timestamps[:-1], truth.poses[:-1])
+    found = evaluate_trajectory(estimate, known)
+    assert found.matched_poses == len(truth) - 1
+    assert (found.end_error_m, found.end_error_deg, found.drift_percent) == (None, None, None)
+    assert found.ate_rmse_m is not None
+    assert evaluate_trajectory(estimate, truth).end_error_m is not None
+
+
+def test_the_best_alignment_has_the_least_nees(rng: np.random.Generator) -> None:
+    """A first pose whose truth is wrong spoils all errors from it, and not those at the best."""
+    truth = wandering(3)
+    sigmas = np.repeat([0.01, 0.05], 3)
+    noise = sigmas * rng.normal(size=(len(truth), 6))
+    poses = truth.poses @ np.array([*map(se3_exp, noise)])
+    covariances = np.tile(np.diag(sigmas**2), (len(truth), 1, 1))
+    world = se3_exp(np.array([0.02, -0.03, 0.05, 0.4, -0.2, 0.1]))
+    before = pose_nees(poses, covariances, world @ truth.poses)
+    after = pose_nees(poses, covariances, best_aligned(poses, covariances, world @ truth.poses))
+    assert before.per_dof is not None
+    assert after.per_dof is not None
+    assert before.per_dof > 10.0
+    assert 0.8 < after.per_dof < 1.2
+    for k in range(6):
+        moved = se3_exp(1e-3 * np.eye(6)[k]) @ best_aligned(poses, covariances, truth.poses)
+        assert pose_nees(poses, covariances, moved).values.sum() > after.values.sum()

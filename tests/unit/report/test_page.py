@@ -67,7 +67,12 @@ def sentences(*estimators: tuple[str, float | None, float | None, str | None]) -
     rng, truth = np.random.default_rng(0), loop(5)
     reports = tuple(
         dataclasses.replace(
-            estimator_report(title, truth, rng), ate_m=ate, nees_per_dof=nees, verdict=verdict
+            estimator_report(title, truth, rng),
+            ate_m=ate,
+            matched_poses=51,
+            judged_poses=40,
+            nees_per_dof=nees,
+            verdict=verdict,
         )
         for title, ate, nees, verdict in estimators
     )
@@ -81,12 +86,29 @@ def test_the_best_is_named_with_its_lead() -> None:
         ("odometry", 2.5, 0.2, "conservative"),
     )
     assert lines[0] == (
-        "isam2 is the most accurate: off by 1.20 cm (root mean square position error, SE3 "
-        "aligned). The next, filter, is off by 3.00 cm, 2.5 times as much."
+        "isam2 is the most accurate: off by 1.20 cm (root mean square position error of 51 "
+        "poses, SE3 aligned). The next, filter, is off by 3.00 cm, 2.5 times as much."
     )
-    assert "Consistent (errors as large as the covariances say): isam2 (NEES 1.1)." in lines
-    assert any(line.startswith("Overconfident") and "filter (NEES 5,000)" in line for line in lines)
+    assert (
+        "Consistent (errors as large as the covariances say): isam2 (NEES 1.1 of 40 poses)."
+        in lines
+    )
+    assert any(
+        line.startswith("Overconfident") and "filter (NEES 5,000 of 40 poses)" in line
+        for line in lines
+    )
     assert any(line.startswith("Conservative") and "odometry" in line for line in lines)
+
+
+def test_truth_that_is_left_out_is_stated_once() -> None:
+    rng, truth = np.random.default_rng(0), loop(5)
+    why = "truth of frames 0 to 10 is off by 0.8 degrees: left out where it is judged"
+    reports = tuple(
+        dataclasses.replace(estimator_report(title, truth, rng), truth_remark=why)
+        for title in ("isam2", "batch")
+    )
+    lines = headline(ReportData("t", "", reports, truth))
+    assert [line for line in lines if "0 to 10" in line] == [f"T{why[1:]}."]
 
 
 def test_errors_within_the_tolerance_count_as_ties() -> None:
