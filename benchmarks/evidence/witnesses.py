@@ -27,7 +27,6 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.types import Remark
-from fgslam.report.content import sentence
 from fgslam.runs.report import located
 from fgslam.slam.session import Session
 
@@ -452,7 +451,7 @@ class Outcome:
         )
         told = "; ".join(self.causes)
         return (self.error_m, self.sigma_m, self.sigmas, odd, told, self.exits,
-                "yes" if self.sigmas <= _SIGMAS or told else "NO")  # fmt: skip
+                "yes" if self.sigmas <= _SIGMAS or (told and self.exits) else "NO")  # fmt: skip
 
 
 def outcome(drive: Drive) -> Outcome:
@@ -466,9 +465,7 @@ def outcome(drive: Drive) -> Outcome:
     true = inverse(drive.truth[n]) @ drive.truth[-1]
     sigma = float(np.sqrt(np.trace(found.covariances[-1][3:, 3:])))
     error = float(np.linalg.norm((inverse(found.trajectory.poses[0]) @ last)[:3, 3] - true[:3, 3]))
-    causes = tuple(
-        one.code if isinstance(one, Remark) else sentence(one)[:60] for one in found.remarks
-    )
+    causes = tuple(one.code for one in found.remarks if isinstance(one, Remark))
     statuses = Counter(str(status) for status in found.column("status"))
     return Outcome(error, sigma, statuses, causes, 0 if enough else 3)
 
