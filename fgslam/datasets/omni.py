@@ -272,7 +272,9 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
             rooms=tuple(rooms) if any(rooms) else None,
             notes=(note,) if extra else (),
         )
-    return recording.select(chosen)
+    recording = recording.select(chosen)
+    require_stitched(recording)
+    return recording
 
 
 def _read_places(
@@ -453,6 +455,39 @@ def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
     return (
         f"{recording.name}: {what}: they are no panoramas of all 360 degrees from end to end, so "
         "directions are wrong; cut off what is next to them, or give the camera that took them",
+    )
+
+
+_BAND = (0.04, 0.12)  # of the height from the edge, where a circle is left to its middle alone
+_NEAR = 0.02  # of the width, around a column
+
+
+def require_stitched(recording: OmniRecording) -> None:
+    """Raises DatasetError where pictures are two fisheyes side by side, as the camera has them.
+
+    Above and below they are black in the corners of both halves and lit in the middle of each.
+    """
+    found = [image.mean(axis=2) for image in _first_pictures(recording)]
+    if found and all(map(_is_two_circles, found)):
+        raise DatasetError(
+            f"{recording.name}: its pictures are two fisheyes side by side and no panoramas; "
+            "stitch them first, by the program of the camera's maker"
+        )
+
+
+def _is_two_circles(grey: FloatArray) -> bool:
+    height, width = grey.shape
+    near = max(1, round(_NEAR * width))
+    a, b = (round(part * height) for part in _BAND)
+
+    def level(rows: FloatArray, column: float) -> float:
+        middle = round(column * (width - 1))
+        return float(np.mean(rows[:, max(0, middle - near) : middle + near + 1]))
+
+    return all(
+        max(level(rows, c) for c in (0.0, 0.5, 1.0)) < _BLACK
+        and min(level(rows, c) for c in (0.25, 0.75)) > _BLACK
+        for rows in (grey[a:b], grey[height - b : height - a])
     )
 
 
