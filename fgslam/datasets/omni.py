@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -272,9 +272,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
             rooms=tuple(rooms) if any(rooms) else None,
             notes=(note,) if extra else (),
         )
-    recording = recording.select(chosen)
-    require_stitched(recording)
-    return recording
+    return recording.select(chosen)
 
 
 def _read_places(
@@ -385,7 +383,15 @@ _LEAST_OFF_PX = 3.0
 _UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
 _BLACK = 16.0  # mean of red, green and blue; a film's black is up to that
 _DARK_SIDES = 0.01  # of the width: so many black columns are no dark corner
-_STEEP = 0.01  # of the steps between columns are larger than any around a real panorama's end
+_SPREAD_OVER = 5  # pictures all over the recording: in one, an edge may lie at its ends
+_NEAR_ENDS = 0.01  # of the width at either side: whose steps the step around is compared with
+_APART = 2.25
+"""Median step around over those: 1.4 at most in whole panoramas of two buildings, 3 to 10 where 5
+degrees are missing."""
+_POLE = 0.15
+"""Spread along a pole's row over that of the row where it is largest: a pole is one point, 0.03 at
+most; ordinary pictures have 0.25 and more."""
+_CORNER = 0.06, 0.03  # of height and width: outside the circle of a lens all four are black
 
 
 def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ...]:
@@ -393,10 +399,13 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
 
     The latter, and a mirror that is where it should be, only of a camera that is stated here, not
     of one that a route brings along.
+
+    Raises:
+        DatasetError: the pictures of a panorama's camera are no panoramas.
     """
     camera = recording.camera
     if isinstance(camera, Equirectangular):
-        return (*_panorama_notes(camera), *_side_notes(recording))
+        return (*_panorama_notes(camera), *_end_notes(recording, camera))
     if isinstance(camera, LensCamera):
         middle, other = ("up", "down") if camera.up else ("down", "up")
         turn = "clockwise" if camera.clockwise else "counter-clockwise"
@@ -428,27 +437,46 @@ def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
     )
 
 
-def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
+def _end_notes(recording: OmniRecording, camera: Equirectangular) -> tuple[str, ...]:
     """A note where the pictures do not go on from their last column to the first one.
 
-    In whole panoramas these are neighbours; here the step between them is larger than nearly all
-    others, or what is next to the picture proper is black.
+    In whole panoramas these are neighbours; here the step between them is larger than those next to
+    it, or what is next to the picture proper is black.
+
+    Raises:
+        DatasetError: they have no poles either, or are round: they are no panoramas at all.
     """
-    ends = []
-    for grey in (image.mean(axis=2) for image in _first_pictures(recording)):
+    at_pole = np.isclose([camera.top_elevation, -camera.bottom_elevation], 0.5 * np.pi)
+    found = []
+    places = np.linspace(0, len(recording) - 1, _SPREAD_OVER).astype(np.int64)
+    for grey in (image.mean(axis=2) for image in _pictures(recording, np.unique(places))):
         lit = np.flatnonzero(grey.max(axis=0) > _BLACK)
+        if not len(lit):
+            continue
+        black = grey.shape[1] - int(lit[-1] - lit[0] + 1)
         steps = np.abs(np.diff(grey)).mean(axis=0)
-        # By how many grey levels the step around exceeds nearly all steps between two columns.
-        around = float(np.abs(grey[:, -1] - grey[:, 0]).mean())
-        unusual = around - float(np.quantile(steps, 1.0 - _STEEP))
-        black = grey.shape[1] - int(lit[-1] - lit[0] + 1) if len(lit) else 0
-        ends.append((black, unusual if len(lit) else 0.0))
-    if not ends:
+        near = max(2, round(_NEAR_ENDS * len(steps)))
+        typical = max(float(np.median([*steps[:near], *steps[-near:]])), 1.0 / near)
+        around = float(np.abs(grey[:, -1] - grey[:, 0]).mean()) / typical
+        spread = grey.std(axis=1)
+        pole = float(np.max(spread[[0, -1]] * at_pole / max(spread.max(), 1.0)))
+        found.append((black, around, pole, _is_round(grey[:, lit[0] : lit[-1] + 1])))
+    if not found:
         return ()
-    black, step = np.median(ends, axis=0)
-    if black > _DARK_SIDES * recording.camera.width:
+    black, around, pole, round_share = np.median(found, axis=0)
+    if round_share == 1.0 or (around > _APART and pole > _POLE):
+        why = (
+            "their corners are black, as of one fisheye or two side by side"
+            if round_share == 1.0
+            else "their right and left ends do not meet, and they have no poles"
+        )
+        raise DatasetError(
+            f"{recording.name}: the pictures are no panoramas: {why}; stitch them first, or give "
+            "the camera that took them, --camera FILE"
+        )
+    if black > _DARK_SIDES * camera.width:
         what = f"{black:.0f} columns of the pictures are black at the sides"
-    elif step > 0.0:
+    elif around > _APART:
         what = "the right and left ends of the pictures do not meet"
     else:
         return ()
@@ -458,44 +486,19 @@ def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
     )
 
 
-_BAND = (0.04, 0.12)  # of the height from the edge, where a circle is left to its middle alone
-_NEAR = 0.02  # of the width, around a column
+def _is_round(grey: FloatArray) -> bool:
+    """Whether all corners are black in rows that are not black all along, as outside a circle."""
+    height, width = (max(1, round(s * n)) for s, n in zip(_CORNER, grey.shape, strict=True))
+    rows = grey[[*range(height), *range(-height, 0)]]
+    corners = rows[:, [*range(width), *range(-width, 0)]]
+    return float(corners.max()) <= _BLACK < float(rows.mean(axis=1).max())
 
 
-def require_stitched(recording: OmniRecording) -> None:
-    """Raises DatasetError where pictures are two fisheyes side by side, as the camera has them.
-
-    Above and below they are black in the corners of both halves and lit in the middle of each.
-    """
-    found = [image.mean(axis=2) for image in _first_pictures(recording)]
-    if found and all(map(_is_two_circles, found)):
-        raise DatasetError(
-            f"{recording.name}: its pictures are two fisheyes side by side and no panoramas; "
-            "stitch them first, by the program of the camera's maker"
-        )
-
-
-def _is_two_circles(grey: FloatArray) -> bool:
-    height, width = grey.shape
-    near = max(1, round(_NEAR * width))
-    a, b = (round(part * height) for part in _BAND)
-
-    def level(rows: FloatArray, column: float) -> float:
-        middle = round(column * (width - 1))
-        return float(np.mean(rows[:, max(0, middle - near) : middle + near + 1]))
-
-    return all(
-        max(level(rows, c) for c in (0.0, 0.5, 1.0)) < _BLACK
-        and min(level(rows, c) for c in (0.25, 0.75)) > _BLACK
-        for rows in (grey[a:b], grey[height - b : height - a])
-    )
-
-
-def _first_pictures(recording: OmniRecording) -> Iterator[Image]:
-    """As many as a check needs, without damaged ones."""
-    for k in range(min(_CHECKED, len(recording))):
+def _pictures(recording: OmniRecording, places: Iterable[int]) -> Iterator[Image]:
+    """Those pictures, without damaged ones."""
+    for k in places:
         with suppress(FrameError):
-            yield recording.image(k)
+            yield recording.image(int(k))
 
 
 def _mirror_notes(
@@ -509,7 +512,7 @@ def _mirror_notes(
         return None
 
     circles = []
-    for image in _first_pictures(recording):
+    for image in _pictures(recording, range(min(_CHECKED, len(recording)))):
         # The rim near where it should be, else around any circle: its holder's, say, is concentric.
         found = circle(image, (centre, radius))
         if found is None and (around := circle(image, None)) is not None:

@@ -20,6 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image as Pillow
 
 from fgslam.cameras.rig import StereoRig
+from fgslam.cameras.rings import find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OutputError
 from fgslam.core.files import remove_left_behind, replacing
@@ -119,6 +120,12 @@ def _views(
             f"{film.name} is {width}x{height}, as large as the calibrated image of one camera: a "
             "film of one camera alone cannot be used; one that shows both squeezed must be "
             "stretched back to twice the width (side by side) or height"
+        )
+    with suppress(CalibrationError):
+        find_mirror_circle(film.load(0), np.random.default_rng(0))
+        raise DatasetError(
+            f"{film.name} shows the round picture of one mirror or fisheye, no stereo pair; routes "
+            f"of such a camera: fgslam teach {settings.path} --camera FILE --out ROUTE"
         )
     raise fault or DatasetError(f"{folder}: no film")
 

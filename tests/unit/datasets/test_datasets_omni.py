@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from dataset_builders import save
 
 from fgslam.cameras.omni import (
     Equirectangular,
@@ -364,16 +363,3 @@ def test_bad_bloggie_files(tmp_path: Path, content: str, reported: str) -> None:
 def test_impossible_settings(make: Callable[[], HyperbolicMirrorSettings], reported: str) -> None:
     with pytest.raises(CalibrationError, match=reported):
         make_camera(make(), (320, 240))
-
-
-def test_two_fisheyes_side_by_side_are_no_panoramas(tmp_path: Path) -> None:
-    """As Ricoh's and Samsung's cameras store them; a whole panorama with a black sky is one."""
-    rows, columns = np.mgrid[:128, :256]
-    noise = np.random.default_rng(1).integers(40, 255, (128, 256), dtype=np.uint8)
-    circles = np.hypot(columns % 128 - 63.5, rows - 63.5) < 64.0
-    for name, lit in (("raw", circles), ("night", rows > 40)):
-        for k in range(3):
-            save(tmp_path / name / f"{k}.png", np.where(lit, noise, 0).astype(np.uint8))
-    assert len(open_omni(PanoramasSettings(path=str(tmp_path / "night")))) == 3
-    with pytest.raises(DatasetError, match="stitch them first"):
-        open_omni(PanoramasSettings(path=str(tmp_path / "raw")))

@@ -424,6 +424,16 @@ def test_a_film_as_large_as_one_view_is_of_one_camera(tmp_path: Path) -> None:
         opened(path)
 
 
+def test_a_film_of_a_mirror_goes_to_teach(tmp_path: Path) -> None:
+    rows, columns = np.mgrid[:240, :320]
+    away = np.hypot(rows - 118, columns - 162)
+    waves = 120 + 60 * np.sign(np.sin(9 * np.arctan2(rows - 118, columns - 162)))
+    round_picture = np.where(away < 110, waves, 12).astype(np.uint8)
+    path = film(tmp_path / "walk.avi", [round_picture] * 3)
+    with pytest.raises(DatasetError, match=rf"one mirror .*: fgslam teach {path} --camera FILE"):
+        opened(path)
+
+
 def test_films_that_are_no_pair(tmp_path: Path) -> None:
     for name in ("front", "back"):
         film(tmp_path / f"{name}.avi", [view(1)])

@@ -19,6 +19,7 @@ from fgslam.cameras.settings import (
     OCamCalibSettings,
 )
 from fgslam.core.arrays import Image
+from fgslam.core.errors import DatasetError
 from fgslam.datasets.omni import camera_notes
 from fgslam.datasets.opening import open_checked, open_omni
 from fgslam.datasets.settings import OmniPathSettings, PanoramasSettings
@@ -158,3 +159,66 @@ def test_pictures_whose_ends_do_not_meet_are_no_whole_panoramas(
     ends = [note for note in found if "no panoramas of all 360 degrees" in note]
     assert len(ends) == (said is not None)
     assert all(f": {said}: " in note for note in ends)
+
+
+def panorama(k: int, width: int = 720) -> Image:
+    """All around and from pole to pole, of a world whose grey values vary smoothly with the ray."""
+    bearing = np.linspace(-np.pi, np.pi, width)
+    elevation = np.linspace(0.5 * np.pi, -0.5 * np.pi, width // 2)[:, None]
+    level = np.cos(elevation)
+    x, y, z = level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation) + 0.0 * bearing
+    waves = np.random.default_rng(0).normal(0.0, 9.0, (12, 3))
+    grey = sum(np.sin(w[0] * x + w[1] * y + w[2] * z + k) for w in waves)
+    image = np.clip(128.0 + 15.0 * np.asarray(grey), 40.0, 255.0).astype(np.uint8)
+    return np.repeat(image[..., None], 3, axis=2)
+
+
+def night(image: Image) -> Image:
+    """The same with a black sky."""
+    return np.where(np.arange(len(image))[:, None, None] > len(image) // 3, image, 0)
+
+
+def two_fisheyes(image: Image) -> Image:
+    """The same size, black outside two circles side by side."""
+    height, width = image.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    away = np.hypot(rows - 0.5 * height, np.mod(columns, width // 2) - 0.25 * width)
+    return np.where((away < 0.5 * height)[..., None], image, 0).astype(np.uint8)
+
+
+def cut(image: Image, degrees: float) -> Image:
+    """The same size, without so many degrees next to the last column."""
+    height, width = image.shape[:2]
+    kept = round(width * (1.0 - degrees / 360.0))
+    return np.asarray(cv2.resize(image[:, :kept], (width, height)), np.uint8)
+
+
+def checked(folder: Path, change: Callable[[Image], Image]) -> tuple[str, ...]:
+    for k in range(4):
+        assert cv2.imwrite(str(folder / f"m{k}.png"), change(panorama(k)))
+    return open_checked(PanoramasSettings(path=str(folder))).notes
+
+
+def test_of_panoramas_355_degrees_are_told_and_whole_ones_pass(tmp_path: Path) -> None:
+    assert checked(tmp_path, lambda image: image) == ()
+    assert checked(tmp_path, night) == ()
+    (note,) = checked(tmp_path, lambda image: cut(image, 5.0))
+    assert "the right and left ends of the pictures do not meet" in note
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (two_fisheyes, r"their corners are black, .* two side by side; stitch them first"),
+        (
+            lambda image: cv2.resize(image[100:190, 100:280], (720, 360)),
+            r"their right and left ends do not meet, .* or give the camera that took them",
+        ),
+    ],
+)
+def test_pictures_that_are_no_panoramas_are_refused(
+    tmp_path: Path, change: Callable[[Image], Image], said: str
+) -> None:
+    """Two fisheyes, whose ends meet in black; a part of the view, which has no poles."""
+    with pytest.raises(DatasetError, match=said):
+        checked(tmp_path, change)
