@@ -254,6 +254,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "remarks": [*answer.estimate.remarks, *filter(None, [sound.why])],
             "judged_poses": first.matched_poses,
             "truth_left_out": sound.left_out.tolist(),
+            "truth_remark": sound.why or None,
         },
     )
     return Judgement(metrics, nees)

@@ -711,6 +711,8 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     knocked = watch is not None and watch.knocked
     if note := calibration_note(outputs.pipeline.calibration, knocked):
         lines.append(note)
+    if why := metrics.more.get("truth_remark"):
+        lines.append(str(why))
     if not metrics.landmarks:
         lines.append(
             "there is no landmark in the map; fgslam inspect states what the recording's fault is"

@@ -142,7 +142,8 @@ def test_verdicts_leave_out_a_truth_that_settles() -> None:
     assert (judged.more["matched_poses"], judged.more["judged_poses"]) == (40, 36)
     assert judged.nees_pose_per_dof == pytest.approx(0.0, abs=1e-9)
     assert judged.end_error_m == pytest.approx(0.0, abs=1e-9)
-    assert "truth of frames 0 to 3 is off by 2.0 degrees" in judged.more["remarks"][-1]
+    assert judged.more["remarks"][-1] == judged.more["truth_remark"]
+    assert "truth of frames 0 to 3 is off by 2.0 degrees" in judged.more["truth_remark"]
 
 
 @pytest.mark.parametrize("kind", ["odometry", "landmark_kalman", "batch"])
