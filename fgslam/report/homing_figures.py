@@ -70,7 +70,12 @@ def curve_figure(
     traces = []
     for one in lines:
         if np.isfinite(one.y).any():
-            rows, style = peaks(one.y, MAX_POINTS), {"width": 1.8, "dash": one.dash}
+            rows = peaks(one.y, MAX_POINTS)
+            style: dict[str, Any] = {"width": 1.8, "dash": one.dash}
+            known = np.pad(np.isfinite(one.y[rows]), 1)
+            alone = known[1:-1] & ~(known[:-2] | known[2:])
+            if alone.any():  # no line is drawn to such a point
+                style |= {"mode": "lines+markers", "marker": {"size": np.where(alone, 5, 0)}}
             traces.append(curve(one.name, one.x[rows], one.y[rows], colour(one.series), **style))
     return Figure(*words, drawing(traces, *axes, yaxis=dict(y or {})))
 

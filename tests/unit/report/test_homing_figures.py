@@ -12,8 +12,10 @@ from fgslam.core.arrays import FloatArray
 from fgslam.report.content import Figure
 from fgslam.report.homing_figures import (
     MAX_MOMENTS,
+    Line,
     Links,
     catchment_figure,
+    curve_figure,
     drive_figure,
     local_map_figure,
     network_figure,
@@ -126,3 +128,16 @@ def test_links_of_each_kind_that_there_is_are_drawn() -> None:
     assert list(figure.drawing.data[-1].text) == ["2", "3", "4"]
     hostile = network_figure(("k", "Pairs", "What."), places, ("<b>", "3", "4"), kinds)
     assert hostile.drawing.data[-1].text[0] == "&lt;b&gt;"
+
+
+def test_an_answer_between_gaps_is_seen() -> None:
+    """No line is drawn to it; the others have none but the line."""
+    x, nan = np.arange(6.0), np.nan
+    figure = curve_figure(
+        ("k", "h", "d"),
+        [Line("alone", 0, x, np.array([1.0, nan, 2.0, nan, 3.0, 3.0])), Line("all", 1, x, x)],
+        ("x", "y"),
+    )
+    alone, whole = figure.drawing.data
+    assert [size > 0 for size in alone.marker.size] == [True, False, True, False, False, False]
+    assert (alone.mode, whole.mode) == ("lines+markers", "lines")

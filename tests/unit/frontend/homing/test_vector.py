@@ -492,3 +492,37 @@ def test_things_in_one_place_say_less_than_things_all_around(width: float) -> No
     )
     assert len(rows) >= 5
     assert (score > 60.0) == (width > 1.0)
+
+
+# --------------------------------------------------------------------------------------------
+# A second motion among the matches: a mirror, a room like another one
+
+
+def turned_in_part(degrees: float, share: float) -> tuple[TwoViews, BearingMatches]:
+    """Two views, in the second of which a share of the things moves as if that was turned."""
+    views = two_views(seed=3, count=240, sigma=np.deg2rad(0.1))
+    turned = np.random.default_rng(0).permutation(240)[: int(share * 240)]
+    bearing_b = views.matches.bearing_b.copy()
+    bearing_b[turned] = wrap(bearing_b[turned] - np.deg2rad(degrees))
+    return views, replace(views.matches, bearing_b=bearing_b)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.0, False), (0.2, False), (0.42, True)])
+def test_a_second_motion_that_is_supported_alike_is_a_refusal(share: float, refused: bool) -> None:
+    _, matches = turned_in_part(60.0, share)
+    found = estimate_homing_vector(matches, SETTINGS, np.random.default_rng(7))
+    assert isinstance(found, Refusal) == refused
+    if isinstance(found, Refusal):
+        assert found.reason is RefusalReason.AMBIGUOUS
+        assert "move alike in a different way" in found.details
+
+
+def test_the_sigma_covers_a_second_motion_near_the_first() -> None:
+    """10 degrees are less than two solutions must differ by; either may be the right one."""
+    views, matches = turned_in_part(10.0, 0.42)
+    found = estimate_homing_vector(matches, SETTINGS, np.random.default_rng(7))
+    assert isinstance(found, TwoViewVector)
+    sigma = np.sqrt(found.covariance[1, 1])
+    for rotation in (views.rotation, views.rotation + np.deg2rad(10.0)):
+        assert abs(wrap(np.array(found.rotation - rotation))) < 1.5 * sigma
+    assert sigma < np.deg2rad(20.0)
