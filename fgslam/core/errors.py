@@ -7,6 +7,7 @@ wrong, where, and how to correct it. The command line catches the root once and 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 _ECHOED = 200
 """Characters of what was given that a message repeats at most."""
@@ -46,6 +47,12 @@ class DatasetError(FgslamError):
 
 class FrameError(DatasetError):
     """One frame cannot be read; the sequence as a whole may still be usable."""
+
+
+class OneImageError(FrameError):
+    """Not all images of a frame can be read; ``frame`` has black ones in place of the others."""
+
+    frame: Any
 
 
 class CalibrationError(DatasetError):

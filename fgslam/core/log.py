@@ -228,13 +228,15 @@ class Frame:
 
     ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``). ``margins``
     are (height, width) of each camera: how far a pixel is from what shows nothing, a black border
-    or what a mask hides, in pixels; empty where all images are full.
+    or what a mask hides, in pixels; empty where all images are full. ``alone`` is
+    the one camera whose image is to be used, 0 right, 1 left, 2 top; None where all are.
     """
 
     index: int
     timestamp: float
     images: tuple[Image, ...]
     margins: tuple[npt.NDArray[np.float32], ...] = ()
+    alone: int | None = None
 
     def digest(self) -> int:
         """64 bits of the images' contents: by them a frame is known again in any recording."""

@@ -288,6 +288,15 @@ def pixel_model(cameras: int, ratio: float) -> FloatArray:
     return model
 
 
+UNKNOWN_DISPARITY_PX = 1e4
+"""Deviation of a disparity that was not measured: wider than any image, next to no information."""
+
+
+def measures_one_image(covariance: FloatArray) -> BoolArray:
+    """Which measurements (k,), by covariances (k, 3, 3), are of one image: the disparity unknown."""
+    return np.asarray(covariance[:, 2, 2] >= UNKNOWN_DISPARITY_PX**2)
+
+
 def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
     """Linear map (3, 2 * cameras) from pixels (c, r) per camera to (column, row, disparity).
 

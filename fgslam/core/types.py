@@ -539,6 +539,7 @@ class EgoMotionStatus(str, Enum):
     DIVERGED = "diverged"
     NO_IMAGE = "no_image"
     CAMERA_FAULT = "camera_fault"
+    ONE_IMAGE = "one_image"
     NOT_LOCATED = "not_located"
 
     @property
@@ -549,6 +550,7 @@ class EgoMotionStatus(str, Enum):
             EgoMotionStatus.CAPPED,
             EgoMotionStatus.RELOCALISED,
             EgoMotionStatus.CONTRADICTED,
+            EgoMotionStatus.ONE_IMAGE,
         )
 
 

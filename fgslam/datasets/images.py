@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import Image
-from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OneImageError
 from fgslam.core.files import require_file
 from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.datasets.layouts import IMAGE_SUFFIXES
@@ -67,8 +67,22 @@ def open_frames(
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
         read = read_colour_image if colour else read_grey_image
-        images = (require_size(read(p, bits), f"image {p}", *size) for p in paths[index])
-        return rig.rectified(tuple(images))
+        images, faults = {}, []
+        for camera, path in enumerate(paths[index]):
+            try:
+                images[camera] = require_size(read(path, bits), f"image {path}", *size)
+            except FrameError as error:
+                faults.append(error)
+        if faults and not images:
+            raise faults[0]
+        first = min(images)
+        black = np.zeros_like(images[first])
+        filled = rig.rectified(tuple(images.get(k, black) for k in range(len(paths[index]))))
+        if faults:
+            fault = OneImageError(str(faults[0]))
+            fault.frame = filled, first
+            raise fault
+        return filled
 
     return load, tuple(notes)
 

@@ -16,7 +16,7 @@ from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.errors import CalibrationError, DatasetError, OneImageError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
@@ -97,7 +97,13 @@ class Recording(Brief):
         margins = self.margins
         if self.rectifier is not None:
             margins = margins or self.rectifier.margins
-        return Frame(index, float(self.timestamps[i]), self.load_images(index, False), margins)
+        try:
+            images = self.load_images(index, False)
+        except OneImageError as error:
+            images, alone = error.frame
+            error.frame = Frame(index, float(self.timestamps[i]), images, margins, alone)
+            raise
+        return Frame(index, float(self.timestamps[i]), images, margins)
 
     def colour(self, i: int) -> tuple[Image, ...]:
         """Images of frame ``i`` in red, green, blue, or grey where the recording is. FrameError."""

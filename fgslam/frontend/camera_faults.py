@@ -495,6 +495,9 @@ class CameraWatch:
         self._before = []
         self._sums = [-1] * rig.cameras
         self._frames = 0
+        self._same = np.zeros(rig.cameras, np.bool_)
+        self.alone: int | None = None
+        """Of the last frame, if it is refused: the first camera whose image is usable."""
 
     def look(
         self, images: tuple[Image, ...], number: int | None = None, moved: bool = False
@@ -529,6 +532,8 @@ class CameraWatch:
             else:
                 seen.append(self._still(pair, here, there))
         fault = repeated or swapped or self._old()
+        good = np.flatnonzero(~(np.array(self._late) | (self._same & bool(repeated))))
+        self.alone = int(good[0]) if fault and not swapped and len(good) else None
         if not fault:
             self._turns.take(self._frames if number is None else number, seen)
         self._before, self._frames = now.images, self._frames + 1
@@ -558,6 +563,11 @@ class CameraWatch:
         before = self._sums
         self._sums = [zlib.crc32(image.tobytes()) for image in images]
         same = [a == b for a, b in zip(before, self._sums, strict=True)]
+        self._same = np.array(same)
+        black = np.array([np.percentile(image[::4, ::4], 99) < _DARKEST for image in images])
+        if black.any() and not black.all():
+            self._same = black
+            return f"the {_names(black.tolist())} camera's image is black"
         if not any(same) or (all(same) and not (moved and images[0].std() > _DARKEST)):
             return ""
         return f"{_named(same)} the image of the frame before once more"
@@ -662,9 +672,12 @@ class CameraWatch:
 
 
 def _named(which: list[bool]) -> str:
-    names = [CAMERA_NAMES[k] for k, one in enumerate(which) if one]
-    verb = "camera delivers" if len(names) == 1 else "cameras deliver"
-    return f"the {' and '.join(names)} {verb}"
+    verb = "camera delivers" if sum(which) == 1 else "cameras deliver"
+    return f"the {_names(which)} {verb}"
+
+
+def _names(which: Sequence[bool]) -> str:
+    return " and ".join(CAMERA_NAMES[k] for k, one in enumerate(which) if one)
 
 
 def _followed_of(a: Image, b: Image, points: FloatArray, which: BoolArray) -> Followed:

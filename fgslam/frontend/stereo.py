@@ -17,6 +17,7 @@ from fgslam.core.correction import RigCorrection
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.log import Frame, clearance
 from fgslam.core.sensors import (
+    UNKNOWN_DISPARITY_PX,
     CameraRig,
     measurement_map,
     partial_map,
@@ -116,6 +117,30 @@ class StereoMatcher:
         kept = np.flatnonzero(good)
         every = (kept,) * len(found)
         return self._measure(found, straight, every, correction, linear), np.asarray(good)
+
+    def alone(
+        self, camera: int, found: Features, correction: RigCorrection | None = None
+    ) -> StereoFeatures:
+        """Features of one camera's image as if it were the reference; disparities are unknown."""
+        n = len(found.xy)
+        straight = found
+        if correction is not None:
+            straight = correction.straightened((found,) * (camera + 1))[camera]
+        measurement = np.column_stack([straight.xy, np.ones(n)])
+        variance = np.repeat([self._settings.pixel_sigma, UNKNOWN_DISPARITY_PX], [2, 1]) ** 2
+        covariance = np.tile(np.diag(variance), (n, 1, 1))
+        pixels = np.full((n, 3, 2), np.nan)
+        pixels[:, camera] = found.xy
+        return StereoFeatures(
+            measurement=measurement,
+            measurement_covariance=covariance,
+            scale=found.scale,
+            orientation=found.orientation,
+            descriptors=found.descriptors,
+            position=triangulate(self._rig, measurement),
+            position_covariance=triangulation_covariance(self._rig, measurement, covariance),
+            pixels=pixels,
+        )
 
     def equally(self, share: float) -> Linear:
         """By images alike good; ``share``: a coordinate's sigma over that of SIFT's."""
@@ -389,6 +414,7 @@ class RigStereo:
         ``by_patches``: whether the latter is asked whatever images have features.
         """
         self._matcher = matcher
+        self.alone = matcher.alone
         self._patches = patches
         self._by_patches = by_patches
 

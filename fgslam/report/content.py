@@ -463,6 +463,8 @@ SENTENCES = {
     "no_features": _NO_MATCHES + "{left}; are the images dark, or 12-bit values in 16-bit images?",
     "no_matches": _NO_MATCHES + "{left}; are left and right swapped, or the images not rectified?",
     "no_matches_fault": _NO_MATCHES + "; {fault}",
+    "one_image": "{fault}: {count} of {all} frames, {span}, are located by that image and begin no "
+    "landmark (mend the camera, or restore the files)",
     "odometry_reversed": _ODOMETRY + "it is the motion backwards ({ratio:.2f} of the way that "
     "images show): give the pose now in the frame before, not its inverse",
     "odometry_scaled": _ODOMETRY + "its ways are {ratio:.2f} +- {scatter:.2f} of those that images "

@@ -168,8 +168,8 @@ def frame_problems(recorder: RunRecorder) -> list[str]:
     lines = []
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
-        if status is EgoMotionStatus.CAMERA_FAULT:  # reported of all of them together
-            continue
+        if status in (EgoMotionStatus.CAMERA_FAULT, EgoMotionStatus.ONE_IMAGE):
+            continue  # reported of all of them together
         if row.problem:
             lines.append(f"frame {number}: {row.problem}")
         elif not status.measured and status is not EgoMotionStatus.FIRST:

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, Image
-from fgslam.core.errors import ConfigError, FrameError
+from fgslam.core.errors import ConfigError, FrameError, OneImageError
 from fgslam.core.log import Frame, ImageSequence, clearance
+from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.core.types import Features
 from fgslam.frontend.features.sift import as_bytes
 
@@ -94,6 +95,9 @@ class FrameDescriber:
         frame = found.frame
         if frame is None or found.features:
             return found
+        if frame.alone is not None:
+            features, ms = _timed(self._extract, *list(_views(frame))[frame.alone])
+            return replace(found, features=(features,), sift_ms=ms)
         if self._reference_only:
             return self.of_reference(found)
         if self._pool is None:
@@ -171,6 +175,8 @@ class FeatureStream:
         start = time.perf_counter()
         try:
             frame: Frame | str = self._sequence.frame(i)
+        except OneImageError as error:
+            frame = error.frame
         except FrameError as error:
             frame = str(error)
         return frame, 1e3 * (time.perf_counter() - start)
@@ -180,6 +186,9 @@ class FeatureStream:
     ) -> _Pending:
         if isinstance(frame, str):
             return _Pending(i, None, frame, load_ms, [])
+        if frame.alone is not None:
+            why = f"the {CAMERA_NAMES[frame.alone]} image alone can be read"
+            return _Pending(i, frame, why, load_ms, [])
         if self._extract is None:
             return _Pending(i, frame, "", load_ms, [])
         timed = partial(_timed, self._extract)

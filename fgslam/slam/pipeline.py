@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import RigCorrection
-from fgslam.core.sensors import Increment, LoopClosure, Odometry
+from fgslam.core.sensors import CAMERA_NAMES, Increment, LoopClosure, Odometry
 from fgslam.core.stopwatch import Stopwatch, timed
 from fgslam.core.store import Kept, has_state, put_back, snapshot
 from fgslam.core.types import (
@@ -145,12 +145,19 @@ class SlamPipeline:
         self, frame: FeatureFrame, index: int, body: Odometry | None = None
     ) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""
-        if self.watch is None or frame.frame is None:
+        if self.watch is None or frame.frame is None or frame.frame.alone is not None:
             return frame
         fault = self.watch.look(frame.frame.images, index, has_moved(body))
         if not fault:
             return frame
-        return dataclasses.replace(frame, frame=None, features=(), problem=fault, refused=True)
+        images, features, alone = None, (), self.watch.alone
+        if alone is not None:
+            images = dataclasses.replace(frame.frame, alone=alone)
+            features = frame.features[alone : alone + 1]
+            fault = f"{fault} (the {CAMERA_NAMES[alone]} image alone is left)"
+        return dataclasses.replace(
+            frame, frame=images, features=features, problem=fault, refused=True
+        )
 
     @timed("predict")
     def _predict(
@@ -179,7 +186,7 @@ class SlamPipeline:
         self, prediction: Prediction, frame: FeatureFrame, landmarks: LandmarkMap
     ) -> CarriedFrame | None:
         """The frame by the landmarks whose patches are tracked into it; None where none are."""
-        if self.key_frames is None or frame.frame is None:
+        if self.key_frames is None or frame.frame is None or frame.frame.alone is not None:
             return None
         return self.key_frames.carry(prediction, landmarks, frame.frame.images, self._correction())
 
@@ -215,7 +222,7 @@ class SlamPipeline:
 
     @timed("stereo")
     def _match_stereo(self, frame: FeatureFrame) -> StereoFeatures:
-        if frame.frame is None:
+        if frame.frame is None or frame.frame.alone is not None:
             return StereoFeatures.empty()
         tried, self._tried = self._tried, None
         if tried and tried[0].frame is frame.frame and tried[0].features is frame.features:
@@ -228,7 +235,9 @@ class SlamPipeline:
     ) -> tuple[StereoFeatures, Matched]:
         """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
         prediction, landmarks, stereo = now.prediction, now.landmarks, now.features
-        if frame.frame is None:
+        if frame.frame is None or frame.frame.alone is not None:
+            if by_one := self._track_alone(now, frame):
+                return stereo, by_one
             status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
             blind = self.tracker.track_blind(prediction, status)
             return stereo, Matched(blind, Association.nothing(), now.odometry)
@@ -263,6 +272,19 @@ class SlamPipeline:
             first = unmeasured(prediction, EgoMotionStatus.FIRST)
             return stereo, Matched(first, association, now.odometry)
         return stereo, Matched(tracked.ego_motion, association, judged.step, (), relocalised)
+
+    def _track_alone(self, now: Frame, frame: FeatureFrame) -> Matched | None:
+        """The frame by its only usable image; None where that fails or odometry contradicts it."""
+        if frame.frame is None or frame.frame.alone is None or not frame.features:
+            return None
+        camera = frame.frame.alone
+        seen = self.stereo.alone(camera, frame.features[0], self._correction())
+        tracked, as_rig = self.tracker.track_alone(camera, now.prediction, now.landmarks, seen)
+        pose = tracked.ego_motion
+        contradicted = self.witnesses.contradicts(now.odometry, now.prediction, pose)
+        if contradicted or not pose.status.measured:
+            return None
+        return Matched(pose, self.tracker.associate_carried(tracked, as_rig), now.odometry)
 
     @timed("places")
     def _recognise_places(
@@ -343,7 +365,7 @@ class SlamPipeline:
 
         Not with images that the watch refuses: what they match is chance, or of two moments.
         """
-        if frame.frame is None:
+        if frame.frame is None or frame.frame.alone is not None:
             return False
         if self.watch is not None:
             before = snapshot(self.watch)

@@ -152,8 +152,9 @@ class Step(Brief):
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space
             at ``wTc``: ``T = wTc * Exp(xi)``.
         status: how the pose was found: `first`, `ok`, `capped`, `relocalised`, `contradicted` (by
-            images that odometry contradicts, and nothing decides between them); or, by odometry
-            alone, `too_few_matches`, `diverged`, `no_image`, `camera_fault`; or not at all,
+            images that odometry contradicts, and nothing decides between them), `one_image` (by
+            that of one camera, the others' being of no use); or, by odometry alone,
+            `too_few_matches`, `diverged`, `no_image`, `camera_fault`; or not at all,
             `not_located` in the map that the session is to begin in: pose and covariance are NaN.
         matches: the k landmarks of the map that the frame sees again: ids (k,), (column, row,
             disparity) (k, 3) in pixels with covariance, raw pixels (k, 3, 2) in right, left, top.
@@ -372,6 +373,8 @@ class FirstImages:
         """Counts a frame with features; ``uint16``: they were given so."""
         if found.frame is None or not found.features or self._frames >= _FRAMES:
             return
+        if found.frame.alone is not None:
+            return
         self._frames += 1
         self._left += [len(own) for own in found.features[1:2]]
         spread = [float(image.std()) for image in found.frame.images[:2]]
@@ -465,17 +468,17 @@ def session_remarks(
 
 def camera_remarks(recorder: RunRecorder) -> tuple[Remark, ...]:
     """One for each fault of a camera, with the frames that are not used for it."""
-    frames: dict[str, list[int]] = {}
+    frames: dict[tuple[str, str], list[int]] = {}
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
-        if row.status == EgoMotionStatus.CAMERA_FAULT.value:
-            frames.setdefault(row.problem, []).append(number)
+        if row.status in ("camera_fault", "one_image"):
+            frames.setdefault((row.status, row.problem), []).append(number)
     return tuple(
         Remark(
-            "cameras_swapped" if "swapped" in fault else "camera_fault",
+            "cameras_swapped" if "swapped" in fault else status,
             tuple(which),
             {"fault": fault, "all": len(recorder)},
         )
-        for fault, which in frames.items()
+        for (status, fault), which in frames.items()
     )
 
 

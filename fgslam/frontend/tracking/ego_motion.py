@@ -12,6 +12,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
@@ -22,17 +23,24 @@ from fgslam.core.geometry import (
     inverse_spd3,
     moved_apart,
     point_pose_jacobian,
+    pose,
     project,
     projection_jacobian,
     reorthonormalise,
     se3_exp,
     se3_log,
     se3_log_jacobian,
+    so3_exp,
     transform_to_camera,
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.sensors import CameraRig, Observations
+from fgslam.core.sensors import (
+    UNKNOWN_DISPARITY_PX,
+    CameraRig,
+    Observations,
+    measures_one_image,
+)
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
@@ -41,6 +49,7 @@ _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
+_UNKNOWN = UNKNOWN_DISPARITY_PX**2
 _KERNEL_WIDTH = 2.0  # of the robust kernel, standard deviations of a residual
 MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
@@ -105,6 +114,7 @@ class EgoMotionSolver:
         settings = self._settings
         if settings.weighting == "uniform":
             covariance = np.tile(np.eye(3), (len(problem), 1, 1))
+            covariance[measures_one_image(problem.measurement_covariance), 2, 2] = _UNKNOWN
         else:
             covariance = problem.measurement_covariance
         if settings.weighting == "landmark":
@@ -459,6 +469,8 @@ _SAMPLES = 200  # of those that keep their shape
 _REFINED = 5  # of these; a few noisy depths make a poor pose, whose count means little
 _START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: next to nothing
 _START_SIGMA_M = 5.0
+_FEWEST_DIRECTIONS = 5  # three give up to four poses; the others tell which
+_SURE = 0.9999  # that all of a sample's matches are right once
 _NEAR = 3.0  # outlier bounds within which a match agrees with a pose from three others
 
 
@@ -508,11 +520,29 @@ class Resection:
         floor = self._solver.floor
         if len(problem) < sample_size(floor):
             return np.empty((0, 4, 4))
+        if measures_one_image(problem.measurement_covariance).all():
+            return self._start_of_one_image(problem)
         local = triangulate(self._solver.sensor, problem.measurement)
         chosen = self._samples(problem, local)
         poses = align(local[chosen], problem.points[chosen], floor)
         agreeing = self._near(poses, problem).sum(axis=1)
         return np.asarray(poses[np.argsort(-agreeing, kind="stable")[:_REFINED]])
+
+    def _start_of_one_image(self, problem: PoseProblem) -> FloatArray:
+        """(1 or 0, 4, 4) the pose by directions alone (Gao et al. 2003), that most agree with."""
+        rig, none = self._solver.sensor, np.empty((0, 4, 4))
+        if len(problem) < _FEWEST_DIRECTIONS:
+            return none
+        matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            problem.points, problem.measurement[:, :2].copy(), matrix, None,
+            iterationsCount=_DRAWN, confidence=_SURE, reprojectionError=_NEAR * self._solver.farthest,
+            flags=cv2.SOLVEPNP_AP3P,
+        )  # fmt: skip
+        if not found or not np.isfinite([turn, shift]).all():
+            return none
+        wTc = inverse(pose(so3_exp(turn.ravel()), shift.ravel()))
+        return self._solver.floor.constrain(wTc)[None]
 
     def _samples(self, problem: PoseProblem, local: FloatArray) -> IntArray:
         """Minimal samples (h, 2 or 3) of the matches; those that keep their shape, if any do."""

@@ -17,7 +17,7 @@ from fgslam.core.geometry import (
     rotate_covariances,
     transform_to_camera,
 )
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, measures_one_image
 from fgslam.core.types import Prediction, StereoFeatures
 from fgslam.frontend.features.matching import alike, pairs_within, pick, resembling
 from fgslam.frontend.settings import AppearanceSettings, DatabaseSettings, MapMatchingSettings
@@ -80,6 +80,8 @@ class MapMatcher:
         for axis in (0, 2, 1):  # the column leaves the fewest pairs to the others
             offset = np.abs(features.measurement[j, axis] - expected.measurement[i, axis])
             near = offset <= reach[i, axis]
+            if axis == 2:
+                near |= measures_one_image(features.measurement_covariance)[j]
             i, j = i[near], j[near]
         same = alike(
             (expected.scale[i], features.scale[j]),

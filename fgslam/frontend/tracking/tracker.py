@@ -10,13 +10,22 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.geometry import (
+    compose_covariance,
     in_front,
+    inverse,
+    pose,
     project,
     rotate_covariances,
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.sensors import CameraRig, Observations
+from fgslam.core.sensors import (
+    UNKNOWN_DISPARITY_PX,
+    CameraRig,
+    Observations,
+    pixel_model,
+    vertical_to_horizontal,
+)
 from fgslam.core.store import Kept
 from fgslam.core.types import (
     EgoMotion,
@@ -254,6 +263,50 @@ class LandmarkTracker:
         if not self.keeps_map:
             self.database.record_carried(matched.ids[inliers], self._missing(tracked))
         return Association(matched, ~inliers, none, none, tracked.matches.features)
+
+    def track_alone(
+        self, camera: int, prediction: Prediction, landmarks: LandmarkMap, found: StereoFeatures
+    ) -> tuple[Tracked, StereoFeatures]:
+        """A frame by one camera's image, and its features as the rig's.
+
+        It is tracked as if that camera were the reference, whose place on the rig is known. Then
+        the landmark's disparity completes each measurement, its error as good as unbounded.
+
+        Args:
+            camera: 0 right, 1 left, 2 top.
+            prediction: of the rig.
+            landmarks: the map.
+            found: features of that image (:meth:`StereoMatcher.alone`).
+        """
+        rig = self.rig
+        offset = np.array([[0, 0, 0], [-rig.baseline, 0, 0], [0, -(rig.vertical_baseline or 0), 0]])
+        cTo, exact = pose(np.eye(3), offset[camera]), np.zeros((6, 6))
+        spread = compose_covariance(cTo, prediction.covariance, exact)
+        tracked = self.track(Prediction(prediction.wTc @ cTo, spread), landmarks, found)
+        found_pose = tracked.ego_motion
+        wTc, status = found_pose.wTc @ inverse(cTo), found_pose.status
+        ego_motion = replace(
+            found_pose,
+            wTc=wTc,
+            covariance=compose_covariance(inverse(cTo), found_pose.covariance, exact),
+            status=EgoMotionStatus.ONE_IMAGE if status.measured else status,
+            weighted_at=None,
+            misfit=math.nan,
+        )
+        rows = tracked.expected.rows[tracked.matches.landmarks]
+        points = transform_to_camera(wTc, landmarks.positions[rows])
+        ahead = in_front(points)
+        disparity = np.ones(len(found))
+        disparity[tracked.matches.features[ahead]] = project(rig, points[ahead])[:, 2]
+        by_disparity = pixel_model(rig.cameras, vertical_to_horizontal(rig))[2 * camera :, 2][:2]
+        along = np.append(-by_disparity, 1.0)
+        measurement, covariance = found.measurement.copy(), found.measurement_covariance.copy()
+        measurement[:, 2] = 0.0
+        measurement += disparity[:, None] * along
+        covariance[:, 2, 2] = 0.0
+        covariance += UNKNOWN_DISPARITY_PX**2 * np.outer(along, along)
+        as_rig = replace(found, measurement=measurement, measurement_covariance=covariance)
+        return replace(tracked, ego_motion=ego_motion), as_rig
 
     def track_blind(self, prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
         """The odometry's pose, for a frame without images; the same that its replay will find."""
