@@ -293,7 +293,7 @@ UNKNOWN_DISPARITY_PX = 1e4
 
 
 def measures_one_image(covariance: FloatArray) -> BoolArray:
-    """Which measurements (k,), by covariances (k, 3, 3), are of one image: the disparity unknown."""
+    """Which measurements (k,) are of one image, by covariances (k, 3, 3): the disparity unknown."""
     return np.asarray(covariance[:, 2, 2] >= UNKNOWN_DISPARITY_PX**2)
 
 

@@ -144,19 +144,21 @@ class SlamPipeline:
     def _check_cameras(
         self, frame: FeatureFrame, index: int, body: Odometry | None = None
     ) -> FeatureFrame:
-        """The frame, without its images where these are not of one moment and this one."""
+        """The frame; of images not of one moment and this one, that of one camera, or none."""
         if self.watch is None or frame.frame is None or frame.frame.alone is not None:
             return frame
         fault = self.watch.look(frame.frame.images, index, has_moved(body))
         if not fault:
             return frame
-        images, features, alone = None, (), self.watch.alone
-        if alone is not None:
-            images = dataclasses.replace(frame.frame, alone=alone)
-            features = frame.features[alone : alone + 1]
-            fault = f"{fault} (the {CAMERA_NAMES[alone]} image alone is left)"
+        alone = self.watch.alone
+        if alone is None:
+            return dataclasses.replace(frame, frame=None, features=(), problem=fault, refused=True)
         return dataclasses.replace(
-            frame, frame=images, features=features, problem=fault, refused=True
+            frame,
+            frame=dataclasses.replace(frame.frame, alone=alone),
+            features=frame.features[alone : alone + 1],
+            problem=f"{fault} (the {CAMERA_NAMES[alone]} image alone is left)",
+            refused=True,
         )
 
     @timed("predict")

@@ -536,12 +536,13 @@ class Resection:
         matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
         found, turn, shift, _ = cv2.solvePnPRansac(
             problem.points, problem.measurement[:, :2].copy(), matrix, None,
-            iterationsCount=_DRAWN, confidence=_SURE, reprojectionError=_NEAR * self._solver.farthest,
-            flags=cv2.SOLVEPNP_AP3P,
+            iterationsCount=_DRAWN, confidence=_SURE,
+            reprojectionError=_NEAR * self._solver.farthest, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
-        if not found or not np.isfinite([turn, shift]).all():
+        vector = np.array([turn, shift], np.float64).reshape(2, 3)
+        if not found or not np.isfinite(vector).all():
             return none
-        wTc = inverse(pose(so3_exp(turn.ravel()), shift.ravel()))
+        wTc = inverse(pose(so3_exp(vector[0]), vector[1]))
         return self._solver.floor.constrain(wTc)[None]
 
     def _samples(self, problem: PoseProblem, local: FloatArray) -> IntArray:

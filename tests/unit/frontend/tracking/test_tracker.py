@@ -29,7 +29,7 @@ from fgslam.frontend.settings import (
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking import tracker as regaining
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import (
     Association,
@@ -289,6 +289,31 @@ def test_nothing_seen_is_a_miss_for_all_in_view() -> None:
     expected = tracked.expected
     np.testing.assert_array_equal(association.missed_ids, expected.ids[expected.certain])
     assert len(association.missed_ids) > 40
+
+
+@pytest.mark.parametrize("camera", range(RIG.cameras))
+@pytest.mark.parametrize("moved", [0.05, 0.8])  # within the windows, and beyond them
+def test_one_image_alone_locates_a_frame(camera: int, moved: float) -> None:
+    rescues = MapMatchingSettings(widen_sigmas=0.0, refine=False, rescue=True)
+    scene = Scene(dataclasses.replace(SETTINGS, matching=rescues))
+    scene.step(np.eye(4))
+    wTc = g.se3_exp(np.array([0.0, 0.01, 0.0, moved / 4.0, 0.0, moved]))
+    found = scene.stereo.alone(camera, scene.world.features(wTc)[camera])
+    prediction = Prediction(np.eye(4), np.diag([0.1] * 3 + [0.5] * 3) ** 2)
+    tracked, features = scene.tracker.track_alone(camera, prediction, scene.map, found)
+    pose = tracked.ego_motion
+    assert pose.status is EgoMotionStatus.ONE_IMAGE
+    error = g.se3_log(g.inverse(wTc) @ pose.wTc)
+    assert error @ np.linalg.solve(pose.covariance, error) < 22.5  # 1 in 1,000, six degrees
+    assert np.linalg.norm(error[3:]) < 0.02
+    # The same frame by what the log holds of it: another camera's features are the rig's now.
+    association = scene.tracker.associate_carried(tracked, features)
+    seen = association.observations.select(~association.rejected)
+    again = EgoMotionSolver(RIG, SETTINGS.ego_motion).solve(
+        Prediction(pose.wTc, np.diag([0.1] * 3 + [0.5] * 3) ** 2), PoseProblem.of(scene.map, seen)
+    )
+    np.testing.assert_allclose(again.wTc, pose.wTc, rtol=0.0, atol=2e-3)
+    assert not seen.is_new.any()
 
 
 # ------------------------------------------------------------------------------------------
