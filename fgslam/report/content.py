@@ -464,7 +464,7 @@ SENTENCES = {
     "no_matches": _NO_MATCHES + "{left}; are left and right swapped, or the images not rectified?",
     "no_matches_fault": _NO_MATCHES + "; {fault}",
     "one_image": "{fault}: {count} of {all} frames, {span}, are located by that image and begin no "
-    "landmark (mend the camera, or restore the files)",
+    "landmark (mend the camera; " + _WATCH + ")",
     "odometry_reversed": _ODOMETRY + "it is the motion backwards ({ratio:.2f} of the way that "
     "images show): give the pose now in the frame before, not its inverse",
     "odometry_scaled": _ODOMETRY + "its ways are {ratio:.2f} +- {scatter:.2f} of those that images "

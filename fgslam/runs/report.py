@@ -68,7 +68,7 @@ from fgslam.runs.tables import (
     picture_title,
 )
 from fgslam.slam.replay import ReplayRow, peak_memory_mb
-from fgslam.slam.results import STAGES, RunRecorder, in_first_map
+from fgslam.slam.results import STAGES, RunRecorder, in_first_map, is_refused
 
 # ------------------------------------------------------------------------------------------
 # The numbers of a run, as metrics.json holds them
@@ -168,8 +168,8 @@ def frame_problems(recorder: RunRecorder) -> list[str]:
     lines = []
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
-        if status in (EgoMotionStatus.CAMERA_FAULT, EgoMotionStatus.ONE_IMAGE):
-            continue  # reported of all of them together
+        if is_refused(row):  # reported of all of them together
+            continue
         if row.problem:
             lines.append(f"frame {number}: {row.problem}")
         elif not status.measured and status is not EgoMotionStatus.FIRST:

@@ -153,7 +153,7 @@ class FeatureStream:
     def __call__(self, start: int = 0) -> Generator[FeatureFrame, None, None]:
         """Yields frames ``start`` and after; stops its threads when closed."""
         pool = ThreadPoolExecutor(os.cpu_count() or 1)
-        waiting: deque[tuple[int, Future[tuple[Frame | str, float]]]] = deque()
+        waiting: deque[tuple[int, Future[tuple[Frame | None, str, float]]]] = deque()
         found: deque[_Pending] = deque()
         upcoming = iter(range(start, len(self._sequence)))
         try:
@@ -171,26 +171,22 @@ class FeatureStream:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _load(self, i: int) -> tuple[Frame | str, float]:
-        start = time.perf_counter()
+    def _load(self, i: int) -> tuple[Frame | None, str, float]:
+        start, frame, fault = time.perf_counter(), None, ""
         try:
-            frame: Frame | str = self._sequence.frame(i)
+            frame = self._sequence.frame(i)
         except OneImageError as error:
             frame = error.frame
+            fault = f"{error}; the {CAMERA_NAMES[error.frame.alone]} image alone is used"
         except FrameError as error:
-            frame = str(error)
-        return frame, 1e3 * (time.perf_counter() - start)
+            fault = str(error)
+        return frame, fault, 1e3 * (time.perf_counter() - start)
 
     def _start(
-        self, i: int, frame: Frame | str, load_ms: float, pool: ThreadPoolExecutor
+        self, i: int, frame: Frame | None, fault: str, load_ms: float, pool: ThreadPoolExecutor
     ) -> _Pending:
-        if isinstance(frame, str):
-            return _Pending(i, None, frame, load_ms, [])
-        if frame.alone is not None:
-            why = f"the {CAMERA_NAMES[frame.alone]} image alone can be read"
-            return _Pending(i, frame, why, load_ms, [])
-        if self._extract is None:
-            return _Pending(i, frame, "", load_ms, [])
+        if frame is None or fault or self._extract is None:
+            return _Pending(i, frame, fault, load_ms, [])
         timed = partial(_timed, self._extract)
         tasks = [pool.submit(timed, *view) for view in islice(_views(frame), self._images)]
         return _Pending(i, frame, "", load_ms, tasks)

@@ -466,11 +466,16 @@ def session_remarks(
     )
 
 
+def is_refused(row: FrameRow) -> bool:
+    """Whether a camera's image was refused: its fault begins with the camera, not with a file."""
+    return row.status in ("camera_fault", "one_image") and row.problem.startswith("the ")
+
+
 def camera_remarks(recorder: RunRecorder) -> tuple[Remark, ...]:
     """One for each fault of a camera, with the frames that are not used for it."""
     frames: dict[tuple[str, str], list[int]] = {}
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
-        if row.status in ("camera_fault", "one_image"):
+        if is_refused(row):
             frames.setdefault((row.status, row.problem), []).append(number)
     return tuple(
         Remark(

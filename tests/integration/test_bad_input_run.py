@@ -54,15 +54,14 @@ def refusal(
     return refused
 
 
-def test_a_frozen_camera_is_said_in_console_status_and_report(
+def test_frozen_cameras_are_said_in_console_status_and_report(
     own_recording: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    images = sorted((own_recording / "left").glob("*.png"))
-    for image in images[5:]:
-        shutil.copyfile(images[4], image)
+    for camera in ("right", "left", "top"):
+        freeze(own_recording / camera)
     output = {"pictures": False, "report": True, "checkpoint_seconds": 0.0}
     config = write_config(tmp_path / "frozen.yaml", experiment(own_recording, output=output))
     status = main(monkeypatch, "run", config, "--out", tmp_path / "run")
@@ -80,6 +79,27 @@ def test_a_frozen_camera_is_said_in_console_status_and_report(
     assert "x: a pose that no landmark measured" in page  # beside the drive from above
     found = metrics_of(tmp_path / "run")["estimators"][KIND]
     assert (found["predicted_frames"], found["predicted_rows"]) == (7, list(range(5, 12)))
+
+
+def freeze(folder: Path) -> None:
+    images = sorted(folder.glob("*.png"))
+    for image in images[5:]:
+        shutil.copyfile(images[4], image)
+
+
+@pytest.mark.parametrize(("frozen", "alone"), [("left", "right"), ("right", "left")])
+def test_frames_of_a_frozen_camera_are_located_by_another(
+    frozen: str, alone: str, own_recording: Path, tmp_path: Path
+) -> None:
+    freeze(own_recording / frozen)
+    run = run_values(experiment(own_recording), tmp_path / "run")
+    words = (
+        f"the {frozen} camera delivers the image of the frame before once more (the {alone} image"
+    )
+    assert any(note.startswith(words) for note in run.result.notes)
+    metrics = metrics_of(tmp_path / "run")
+    assert metrics["status_counts"]["one_image"] == 7
+    assert metrics["estimators"][KIND]["ate_rmse_m"] < 0.01
 
 
 def replace_line(path: Path, number: int, line: str) -> None:
@@ -130,7 +150,7 @@ SPOILING = (remove_image, truncate_image, damage_image, empty_image, resize_imag
         (remove_image, "constant_velocity"),
     ],
 )
-def test_an_unusable_image_is_bridged(
+def test_a_frame_with_an_unusable_image_is_located_by_another(
     spoil: Callable[[Path], str],
     odometry: str,
     own_recording: Path,
@@ -148,12 +168,13 @@ def test_an_unusable_image_is_bridged(
     out = capfd.readouterr().out
     assert_valid_results(folder, 12)
     metrics = metrics_of(folder)
-    assert metrics["status_counts"]["no_image"] == 1
-    assert metrics["frames_without_image"] == 1
+    assert metrics["status_counts"]["one_image"] == 1
+    assert metrics["frames_without_image"] == 0
     (problem,) = metrics["frame_problems"]
     assert problem.startswith(f"frame 6: image {image} ")
     assert why in problem
-    assert "no_image 1" in out
+    assert problem.endswith("the right image alone is used")
+    assert "one_image 1" in out
     assert f"note        {problem}" in out
     assert metrics["estimators"][KIND]["ate_rmse_m"] < 0.01
 

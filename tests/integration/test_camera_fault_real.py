@@ -50,8 +50,10 @@ def test_the_end_of_a_drive_with_a_late_camera_is_as_uncertain_as_it_is_wrong(
         assert deviations > 3.0  # what the watch is for
         return
     assert deviations < 2.0
-    assert found["located"] == {"frames": LATE_FROM, "of": FRAMES}
-    assert found["status_counts"]["camera_fault"] == FRAMES - LATE_FROM
-    assert own["predicted_frames"] == FRAMES - LATE_FROM
+    # The right image alone locates frames as long as landmarks from before are in view.
+    counts = found["status_counts"]
+    assert counts["one_image"] >= 15
+    assert counts["one_image"] + counts["camera_fault"] == FRAMES - LATE_FROM
+    assert own["predicted_frames"] == counts["camera_fault"]
     assert any("the left camera" in note for note in result.notes)
     assert not result.located.enough
