@@ -517,7 +517,8 @@ class CameraWatch:
         seen: list[LineRows] = []
         for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
-            self._order(pair, self._factor * (there - here)[:, camera - 1])
+            if not repeated:  # else they are of two moments
+                self._order(pair, self._factor * (there - here)[:, camera - 1])
             if pair.swapped and not swapped:
                 swapped = (
                     f"the images of the right and the {CAMERA_NAMES[camera]} camera are swapped"

@@ -469,7 +469,7 @@ _SAMPLES = 200  # of those that keep their shape
 _REFINED = 5  # of these; a few noisy depths make a poor pose, whose count means little
 _START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: next to nothing
 _START_SIGMA_M = 5.0
-_FEWEST_DIRECTIONS = 5  # three give up to four poses; the others tell which
+_FEWEST_DIRECTIONS = 5  # three leave four poses at most; the others tell which
 _SURE = 0.9999  # that all of a sample's matches are right once
 _NEAR = 3.0  # outlier bounds within which a match agrees with a pose from three others
 
