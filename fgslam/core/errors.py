@@ -7,7 +7,7 @@ wrong, where, and how to correct it. The command line catches the root once and 
 from __future__ import annotations
 
 import re
-from typing import Any
+import typing
 
 _ECHOED = 200
 """Characters of what was given that a message repeats at most."""
@@ -52,7 +52,7 @@ class FrameError(DatasetError):
 class OneImageError(FrameError):
     """Not all images of a frame can be read; ``frame`` has black ones in place of the others."""
 
-    frame: Any
+    frame: typing.Any
 
 
 class CalibrationError(DatasetError):
