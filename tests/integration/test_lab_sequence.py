@@ -107,6 +107,12 @@ def test_stride_composes_increments_and_covariances() -> None:
     np.testing.assert_allclose(both.covariance, expected, rtol=1e-10)
 
 
+def test_what_is_brighter_than_white_is_white(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendered.World, "image", lambda *_: np.full((30, 40), 256.0))
+    small = replace(QUICK, rig=LabRigSettings(width=40, height=30))
+    assert (opened(small, (0, 1)).frame(0).images[0] == 255).all()
+
+
 def test_two_cameras_and_another_size() -> None:
     rig = LabRigSettings(width=100, height=50, vertical_baseline_m=None, baseline_m=0.2)
     frame = opened(replace(QUICK, rig=rig), (0, 1)).frame(0)

@@ -67,6 +67,7 @@ def test_targets_were_taken_at_another_time(world: OmniWorld) -> None:
     now, then = world.image(0.0).astype(float), world.targets[0].astype(float)
     assert 2.0 < np.abs(now - then).mean() < 30.0
     assert np.corrcoef(now.ravel(), then.ravel())[0, 1] > 0.9
+    assert 0.7 * now.mean() < then.mean() < now.mean()
     again = world.image(0.1).astype(float)
     noise = (again - now)[np.minimum(now, again).min(axis=2) > 30]
     assert noise.std() == pytest.approx(np.sqrt(2.0) * SETTINGS.noise_grey, rel=0.1)

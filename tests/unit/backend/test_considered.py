@@ -19,6 +19,7 @@ from fgslam.backend.considered import (
     ConsiderCovariance,
     ErrorColumns,
     SampledErrors,
+    lacking,
     shared_covariance,
 )
 from fgslam.backend.filters.kalman import LandmarkKalman
@@ -84,6 +85,14 @@ def test_columns_are_their_landmarks_whatever_comes_and_goes() -> None:
     asked = np.array([*sorted(expected), 999])
     found = [*(expected[i] for i in sorted(expected)), np.zeros((3, _COUNT))]
     assert np.array_equal(again.kept("columns", asked), found)
+
+
+@pytest.mark.parametrize("size_m", [1e-3, 1.0, 1e5])
+def test_only_what_has_no_variance_in_a_direction_lacks_some_however_large(size_m: float) -> None:
+    far, flat = size_m**2 * np.array([np.diag([1e-6, 1e-6, 1.0]), np.diag([0.0, 1.0, 1.0])])
+    added = lacking(np.array([far, flat]))
+    assert not added[0].any()
+    assert 0.0 < np.linalg.eigvalsh(flat + added[1]).min() < 1e-6 * size_m**2
 
 
 # ------------------------------------------------------------------------------------------

@@ -507,6 +507,14 @@ def test_a_second_closure_that_agrees_moves_nothing() -> None:
     assert "nothing moved" in reported[1]
 
 
+def test_a_landmark_counts_as_found_again_from_its_first_return_on() -> None:
+    frames = np.array([70, 71, 71 + LONG_UNSEEN, 72 + LONG_UNSEEN, 5, 4 + LONG_UNSEEN])
+    variables = np.array([1, 1, 1, 1, 3, 3])
+    expected = np.array([False, False, True, True, False, False])
+    for order in (np.arange(6), np.array([5, 2, 0, 4, 3, 1])):
+        np.testing.assert_array_equal(found_again(frames[order], variables[order]), expected[order])
+
+
 def found_again_where_expected(estimator: Any, count: int) -> None:
     """Old landmarks, found again at the drifted pose where the drifted map has them: all wrong."""
     builder, solver = estimator.builder, estimator.solver

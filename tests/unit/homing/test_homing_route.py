@@ -109,6 +109,17 @@ def test_features_that_neighbours_show_are_kept_first(film: list[Image]) -> None
     assert np.isin(whole.sift.bearing[weakest], kept.sift.bearing).all()
 
 
+def test_of_columns_with_equal_votes_the_longest_are_kept() -> None:
+    rng, most = np.random.default_rng(2), 2 * MOST_COLUMNS
+    lengths = rng.permutation(most) / most
+    columns = ColumnSegments(
+        np.full(most, 0.1), np.full(most, 0.01), np.column_stack([-lengths, np.zeros(most)]),
+        np.full((most, 2), 0.01), np.zeros((most, 11)),
+    )  # fmt: skip
+    kept = compacted(OmniFeatures(some_features(0, 0).sift, columns)).columns
+    assert sorted(-kept.tangents[:, 0]) == sorted(lengths)[MOST_COLUMNS:]
+
+
 def _matches_of(rows: FloatArray, count: int) -> BearingMatches:
     n, none = len(rows), np.zeros(len(rows))
     return BearingMatches(

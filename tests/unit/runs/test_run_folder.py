@@ -204,6 +204,12 @@ def test_removing_units_leaves_files_of_others(tmp_path: Path) -> None:
     assert is_finished(tmp_path)
 
 
+def test_what_is_kept_nowhere_and_what_is_nothing_are_handed_back(tmp_path: Path) -> None:
+    assert UnitStore(None).add("replays", {0: 1.5}, float) == {0: 1.5}
+    assert UnitStore(tmp_path).add("replays", {}, float) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_removing_units_removes_their_folder(tmp_path: Path) -> None:
     store = UnitStore(tmp_path)
     store.add("replays", {0: 1.5}, float)

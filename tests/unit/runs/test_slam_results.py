@@ -9,14 +9,17 @@ from simulated import RIG
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.log import MeasurementLog
+from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import Increment, Observations
-from fgslam.core.types import Trajectory
+from fgslam.core.types import LandmarkAppearances, LandmarkMap, Trajectory
+from fgslam.frontend.settings import DatabaseSettings, FrontendSettings
 from fgslam.runs.tasks.slam_results import (
     alignment_slack,
     at_edges,
     medians_of,
     points_under,
     rendered_landmark_truth,
+    true_sights,
 )
 
 
@@ -94,6 +97,41 @@ def test_rendered_truth_is_of_landmarks_on_one_surface() -> None:
     assert truth.ids.tolist() == [0, 2]
     np.testing.assert_allclose(truth.positions[:, 2], [4.0, 2.0])
     np.testing.assert_array_equal(sigma, 0.0)
+
+
+def test_landmarks_in_view_are_in_every_image_and_not_hidden() -> None:
+    seen_before, seen_from_behind, hidden, below_the_top_image = range(4)
+    depth = np.full(4, 4.0)  # metres; the wall's right half has something before it
+    pixels = np.array([[60.0, 50.0], [90.0, 80.0], [200.0, 50.0], [60.0, RIG.height - 4.0]])
+    points = g.triangulate(RIG, np.column_stack([pixels, RIG.fx * RIG.baseline / depth]))
+    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
+    directions[seen_from_behind] *= -1.0
+    ids, n = np.arange(4), len(points)
+    landmarks = LandmarkMap(ids, points, np.tile(1e-4 * np.eye(3), (n, 1, 1)))
+    saved = SavedMap(
+        RIG,
+        landmarks,
+        LandmarkAppearances(
+            ids, np.zeros((n, 128), np.uint8), np.full(n, 12.0), np.zeros(n), directions
+        ),
+        hits=np.full(n, 9),
+        misses=np.zeros(n, np.int64),
+        farthest=np.full(n, 9.0),
+        permanent=np.zeros(n, np.bool_),
+        colour=np.zeros(n, np.uint8),
+        trajectory=OneWall.ground_truth,
+        about={},
+        evidence=np.empty(0, np.int64),
+    )
+    settings, found = FrontendSettings(database=DatabaseSettings(viewpoints=True)), {}
+    for which in range(4):
+        one = landmarks.select(np.array([which]))
+        in_view = true_sights(saved, one, OneWall(), settings)  # type: ignore[arg-type]
+        found[which] = in_view(0, np.eye(4))
+    assert found == {
+        seen_before: (1, 1), seen_from_behind: (1, 0), hidden: (0, 0), below_the_top_image: (0, 0)
+    }  # fmt: skip
+    assert in_view(0, np.full((4, 4), np.nan)) == (-1, -1)
 
 
 def test_a_straight_drive_leaves_the_roll_open_and_a_bent_one_does_not() -> None:

@@ -110,6 +110,13 @@ def test_all_furniture_stands_in_its_room(house: tuple[Thing, ...]) -> None:
             assert (corners < high + 0.1).all(), thing.name
 
 
+@pytest.mark.parametrize("build", [build_house, build_corridors, build_lab])
+def test_lamps_hang_within_the_place(build: Callable[[np.random.Generator], Place]) -> None:
+    place = build(rng())
+    for corner in (place.lamps[:, 0, :2], place.lamps.sum(axis=1)[:, :2]):
+        assert ((corner > place.low) & (corner < place.high)).all()
+
+
 def test_each_leg_is_the_one_before_turned_by_a_quarter() -> None:
     place = build_corridors(rng())
     things, lamps = place.things, place.lamps

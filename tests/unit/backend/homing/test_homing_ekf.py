@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -14,6 +15,7 @@ from fgslam.backend.homing.ekf import (
     INITIAL_SPEED,
     FilterState,
     HomingEkf,
+    Measured,
     initial_state,
     motion,
     predicted,
@@ -88,6 +90,20 @@ def test_motion_derivative() -> None:
         np.testing.assert_allclose(jacobian[:, k], numeric, atol=1e-9)
     half = np.sqrt(np.diagonal(motion(robot, 0.1)[2]) * 2.0)
     np.testing.assert_allclose(np.sqrt(np.diagonal(spread)), half)
+
+
+@pytest.mark.parametrize("seen_from", [seen_from_robot, seen_from_target])
+def test_derivatives_of_bearings(seen_from: Callable[..., Measured]) -> None:
+    rng = np.random.default_rng(5)
+    features, measured, sigma = 4, rng.uniform(-np.pi, np.pi, 4), np.full(4, 0.01)
+    state = FilterState(np.arange(features), rng.uniform(0.5, 1.5, 7 + 2 * features), np.eye(15))
+    jacobian = seen_from(state, measured, sigma).jacobian
+    for k, step in enumerate(1e-6 * np.eye(len(state.mean))):
+        before, after = (
+            seen_from(replace(state, mean=state.mean + by), measured, sigma).innovation
+            for by in (-step, step)
+        )
+        np.testing.assert_allclose(jacobian[:, k], wrap(before - after) / 2e-6, atol=1e-7)
 
 
 def test_gate_keeps_gross_bearings_out() -> None:

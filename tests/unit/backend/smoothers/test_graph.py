@@ -108,6 +108,20 @@ def test_a_landmark_waits_for_its_second_sighting_and_loses_none() -> None:
     np.testing.assert_array_equal(second.values.atPoint3(key), points[4])
 
 
+def test_a_variable_is_described_by_its_own_sightings_while_it_is_in_use() -> None:
+    points = {4: [0.2, 0.1, 3.0]}
+    made = builder()
+    for k in range(2):
+        made.add(frame(k, points, k == 0), known(points))
+    assert made.describe(0) == "landmark 4 (seen 2 times, last from frame 1)"
+    made.admission.pruned(np.array([4]))
+    assert made.describe(0) == "landmark 4 (no longer in use)"
+    for k in range(2, 5):
+        made.add(frame(k, points, k == 2), known(points))
+    assert made.describe(0) == "landmark 4 (no longer in use)"
+    assert made.describe(1) == "landmark 4 (seen 3 times, last from frame 4)"
+
+
 @pytest.mark.parametrize(
     ("sigma", "expected"),
     [(1.01 / 3, "waits"), (0.99 / 3, "weak"), (1.01 / 8, "weak"), (0.99 / 8, "plain")],

@@ -17,7 +17,7 @@ from fgslam.backend.settings import EstimatorSettings, Isam2Settings, LandmarkKa
 from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.core.types import LandmarkMap, RelocalisationStatus, StereoFeatures
+from fgslam.core.types import DegreesOfFreedom, LandmarkMap, RelocalisationStatus, StereoFeatures
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.features.matching import Neighbours
 from fgslam.frontend.places import relocalisation as relocaliser
@@ -37,7 +37,7 @@ from fgslam.frontend.places.relocalisation import (
     specific,
 )
 from fgslam.frontend.settings import FrontendSettings, RelocalisationSettings
-from fgslam.frontend.tracking.ego_motion import align, align_in_space, rigid
+from fgslam.frontend.tracking.ego_motion import align, align_in_space, rigid, sample_size
 from fgslam.slam.build import make_motion, make_places
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
@@ -65,6 +65,17 @@ def test_alignment_in_space_is_exact_and_never_mirrors(rng: np.random.Generator)
     found = align_in_space(_seen_from(truth, there), there)
     assert np.allclose(found, truth, atol=1e-9)
     assert np.allclose(np.linalg.det(found[:, :3, :3]), 1.0)
+
+
+@pytest.mark.parametrize("dof", [3, 6])
+def test_a_sample_has_as_many_matches_as_fix_a_pose_and_no_more(
+    rng: np.random.Generator, dof: DegreesOfFreedom
+) -> None:
+    truth, size = planar(0.7, -1.3, 0.4), sample_size(floor(dof))
+    there = rng.uniform(-5.0, 5.0, (4, size, 3))
+    for count, fixed in ((size, True), (size - 1, False)):
+        found = align(_seen_from(truth, there[:, :count]), there[:, :count], floor(dof))
+        assert np.isclose(found, truth, atol=1e-9).all(axis=(1, 2)).tolist() == 4 * [fixed]
 
 
 def test_rigidity_keeps_true_samples_and_drops_stretched_and_thin_ones(

@@ -112,14 +112,15 @@ def test_an_edge_of_the_image_is_inside() -> None:
 
 
 def test_what_is_too_small_to_be_found_is_not_expected() -> None:
-    points = g.triangulate(RIG, np.array([[100.0, 80.0, 10.0], [200.0, 120.0, 10.0]]))
-    database = database_of(points, DatabaseSettings(least_scale_px=1.0))
+    points = g.triangulate(RIG, np.array([[100.0, 80.0, 10.0], [200.0, 120.0, 20.0]]))
+    database = database_of(points, DatabaseSettings(least_scale_px=2.0))
     first_scale = 3.0  # pixels, seen from the origin
-    for back in (0.0, 2.0, 6.0, 9.0):
+    for back, count in ((0.0, 2), (2.0, 1), (6.0, 0)):
         wTc = g.pose(np.eye(3), np.array([0.0, 0.0, -back]))
         scale = first_scale * points[:, 2] / (points[:, 2] + back)
         found = database.expected(landmark_map(points), wTc)
-        assert found.ids.tolist() == np.flatnonzero(scale >= 1.0).tolist()
+        assert found.ids.tolist() == np.flatnonzero(scale >= 2.0).tolist()
+        assert len(found.ids) == count
         np.testing.assert_allclose(found.scale, scale[found.ids])
 
 
