@@ -31,7 +31,6 @@ def linked(recording: Path, target: Path, **cameras: str) -> Path:
         "euroc_v101_kf100",
         "kitti06",
         pytest.param("kitti_raw_0926_5hz", marks=pytest.mark.slow),
-        pytest.param("stanford_chess_grid", marks=pytest.mark.slow),
     ],
 )
 def test_real_recordings_have_no_problem(shared_data: Path, name: str) -> None:

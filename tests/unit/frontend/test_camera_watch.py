@@ -218,7 +218,6 @@ SOUND = (
     "kitti_raw_0926_5hz",
     "euroc_v101_kf100",
     "euroc_v101_raw",
-    "stanford_chess_grid",
     "rgbd_fr1",
     "stereo_raw/euroc_V1_01_cut",
     "stereo_raw/kimera_test_pairs/ForStereoFrame",
