@@ -345,6 +345,11 @@ def read_table(
     return table
 
 
+def records(table: Mapping[str, npt.NDArray[Any]]) -> list[dict[str, Any]]:
+    """The rows of a table: its columns' values by name."""
+    return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+
+
 def _parsed(cell: str) -> float:
     try:
         return float(cell)

@@ -17,10 +17,9 @@ from fgslam.core.types import Features
 from fgslam.report.content import bulk_limits, level_axes
 from fgslam.report.results import ReportData
 
-# Okabe and Ito's colours, which the colour-blind can tell apart; in blue, green, red.
-_INK, _PAPER, _RIM = (34, 34, 34), (255, 255, 255), (20, 20, 20)
-_DOT = (160, 150, 140)
-_ORANGE, _SKY, _YELLOW = (0, 159, 230), (233, 180, 86), (66, 228, 240)
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+ORANGE, SKY, YELLOW, INK = "#E69F00", "#56B4E9", "#F0E442", "#222222"
+_DOT, _RIM = "#8C96A0", "#141414"
 _WHITE = 0.78  # whites become this grey, so that bright marks stand out on windows and posters
 _ALONE_PX, _BESIDE_PX = 1400, 900  # widths of images, alone in a row or not
 _PANORAMIC_ASPECT = 2.2  # wider images are stacked rather than set side by side
@@ -51,7 +50,7 @@ def draw_features(
     panels = []
     for k in reversed(range(count)):
         panel, scale = _enlarged(images[k], _ALONE_PX if stacked else _BESIDE_PX)
-        _draw_lines(panel, scale * (oriented_squares(features[k]) + 0.5), [_YELLOW])
+        _draw_lines(panel, scale * (oriented_squares(features[k]) + 0.5), [_bgr(YELLOW)])
         panel = _headed(panel, _CAMERAS[k], f"{len(features[k])} features")
         apart = (0, 0 if stacked else _MARGIN_PX)
         panels.append(np.pad(panel, ((0, 0), apart, (0, 0)), constant_values=255))
@@ -132,11 +131,11 @@ def draw_flow(
         note += f", median flow {np.median(flow):.1f} px"
     panel, scale = _enlarged(image, _ALONE_PX)
     start, end = scale * (before + 0.5), scale * (after + 0.5)
-    _draw_lines(panel, np.stack([start, end], axis=1), [_SKY])
-    _draw_dots(panel, start, [_YELLOW])
+    _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
+    _draw_dots(panel, start, [_bgr(YELLOW)])
     arm = np.array([[-5.0, -5.0], [5.0, 5.0]])
     for stroke in (arm, arm * [1.0, -1.0]):
-        _draw_lines(panel, end[:, None] + stroke, [_ORANGE])
+        _draw_lines(panel, end[:, None] + stroke, [_bgr(ORANGE)])
     legend = "dot: where it was in the earlier frame; line: its motion; cross: where it is"
     below = np.full((_HEADING_PX, panel.shape[1], 3), 255, np.uint8)
     _put_text(below, legend, (_MARGIN_PX, 0.65 * _HEADING_PX))
@@ -169,22 +168,24 @@ def draw_plan(path: Path, data: ReportData) -> None:
     inside = ((dots > limits[:, 0]) & (dots < limits[:, 1])).all(axis=1)
     columns, rows = np.clip(pixels(dots[inside]).astype(int), 0, [wide - 1, tall - 1]).T
     for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        canvas[np.minimum(rows + down, tall - 1), np.minimum(columns + right, wide - 1)] = _DOT
-    lines = [(way, _SKY, 3)]
+        canvas[np.minimum(rows + down, tall - 1), np.minimum(columns + right, wide - 1)] = _bgr(
+            _DOT
+        )
+    lines = [(way, _bgr(SKY), 3)]
     if data.truth is not None:
-        lines.append((data.truth.poses[:, :3, 3] @ level.T, _INK, 1))
+        lines.append((data.truth.poses[:, :3, 3] @ level.T, _bgr(INK), 1))
     for points, colour, thickness in lines:
         known = points[np.isfinite(points).all(axis=1)]
         cv2.polylines(
             canvas, [_fixed(pixels(known))], False, colour, thickness, cv2.LINE_AA, _SHIFT
         )
-    _draw_dots(canvas, pixels(way[-1:]), [_ORANGE])
+    _draw_dots(canvas, pixels(way[-1:]), [_bgr(ORANGE)])
     # The longest of 1, 2 and 5 times a power of ten metres that a third of the picture holds.
     room = wide / 3.0 / scale
     power = 10.0 ** np.floor(np.log10(room))
     length = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= room)
     end = np.array([[_MARGIN_PX, tall - 15.0], [_MARGIN_PX + scale * length, tall - 15.0]])
-    cv2.polylines(canvas, [_fixed(end)], False, _INK, 3, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(canvas, [_fixed(end)], False, _bgr(INK), 3, cv2.LINE_AA, _SHIFT)
     _put_text(canvas, f"{length:g} m", (_MARGIN_PX, tall - 24.0))
     words = "blue: path; grey: landmarks" + "; black: truth" * (data.truth is not None)
     title = f"{data.title}: {one.title}, {len(dots):,} landmarks"
@@ -194,11 +195,20 @@ def draw_plan(path: Path, data: ReportData) -> None:
 def _enlarged(image: Image, width: int) -> tuple[Image, float]:
     """The image, dimmed, in blue, green, red at a width near to ``width``; and its scale."""
     scale = max(1.0, float(round(width / image.shape[1])))
-    darkest, brightest = np.percentile(image, [0.5, 99.5])
-    span = max(float(brightest - darkest), 32.0) / _WHITE
+    darkest, span = dimmed_range(image)
     grey = cv2.convertScaleAbs(np.maximum(image, darkest) - darkest, alpha=255.0 / span)
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), scale
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8), scale
+
+
+def dimmed_range(image: Image) -> tuple[float, float]:
+    """The level that is shown black, and how far above it white would be."""
+    darkest, brightest = np.percentile(image, [0.5, 99.5]).tolist()
+    return darkest, max(brightest - darkest, 32.0) / _WHITE
+
+
+def _bgr(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:])[::-1])
 
 
 def _headed(panel: Image, title: str, note: str) -> Image:
@@ -214,7 +224,7 @@ def _headed(panel: Image, title: str, note: str) -> Image:
 
 def _put_text(canvas: Image, text: str, at: tuple[float, float], weight: int = 400) -> None:
     place = (round(at[0]), round(at[1]))
-    cv2.putText(canvas, text, place, _INK, cv2.FontFace("sans"), _TEXT_PX, weight)
+    cv2.putText(canvas, text, place, _bgr(INK), cv2.FontFace("sans"), _TEXT_PX, weight)
 
 
 def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]) -> None:
@@ -223,7 +233,7 @@ def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]
     Of one colour, or each of its own.
     """
     points = list(_fixed(lines))
-    cv2.polylines(canvas, points, False, _RIM, 4, cv2.LINE_AA, _SHIFT)
+    cv2.polylines(canvas, points, False, _bgr(_RIM), 4, cv2.LINE_AA, _SHIFT)
     for colour, group in zip(colours, [points] if len(colours) == 1 else points, strict=True):
         own = group if len(colours) == 1 else [group]
         cv2.polylines(canvas, own, False, colour, 2, cv2.LINE_AA, _SHIFT)
@@ -232,7 +242,7 @@ def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]
 def _draw_dots(canvas: Image, centres: FloatArray, colours: list[tuple[int, ...]]) -> None:
     for k, centre in enumerate(_fixed(centres)):
         place = tuple(centre.tolist())
-        cv2.circle(canvas, place, 5 << _SHIFT, _RIM, -1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(canvas, place, 5 << _SHIFT, _bgr(_RIM), -1, cv2.LINE_AA, _SHIFT)
         colour = colours[k % len(colours)]
         cv2.circle(canvas, place, 4 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
 

@@ -25,22 +25,15 @@ from matplotlib.ticker import MaxNLocator
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.files import replacing
 from fgslam.report.content import Figure, bulk_limits
+from fgslam.report.overlays import INK, ORANGE, SKY, YELLOW, dimmed_range
 
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-ORANGE = "#E69F00"
-SKY = "#56B4E9"
-YELLOW = "#F0E442"
 VERMILLION = "#D55E00"
-INK = "#222222"
 FAINT = "#DDDDDD"
 
 MAP_COLOURS = "viridis"
 """Perceptually uniform, readable without colour vision and in grey print."""
 
 DPI = 160
-
-# On the screen whites become this grey, so that bright marks stand out on windows and posters.
-_WHITE = 0.78
 
 PICTURE_STYLE: dict[str, Any] = {
     "font.size": 12.0,
@@ -91,8 +84,7 @@ def picture(path: Path, width: float, height: float) -> Iterator[Canvas]:
 def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
     """An image, dimmed so that bright marks stand out (in colour: as it is), without axes."""
     height, width = image.shape[:2]
-    darkest, brightest = np.percentile(image, [0.5, 99.5])
-    span = max(float(brightest - darkest), 32.0) / _WHITE
+    darkest, span = dimmed_range(image)
     smooth: dict[str, Any] = {"interpolation": "bicubic", "interpolation_stage": "data"}
     axes.imshow(image, cmap="gray", vmin=darkest, vmax=darkest + span, **smooth)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
@@ -112,20 +104,17 @@ def colour_bar(axes: Axes, colours: ScalarMappable, label: str, extend: str = "n
     bar.outline.set_visible(False)
 
 
-def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any) -> LineCollection:
-    """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike.
-
-    ``colours`` are those of a LineCollection (`color`, or `array`, `cmap` and `norm`).
-    """
+def add_segments(axes: Axes, segments: FloatArray, width: float, colour: str) -> None:
+    """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike."""
     # Two collections: as an effect of its path each line would be drawn by itself, and ten times
     # as long.
     ends: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
     paths = list(segments)
-    rims = LineCollection(paths, linewidths=width + 1.4, color="black", alpha=0.55, **ends)
-    lines = LineCollection(paths, linewidths=width, **ends, **colours)
-    for drawn in (rims, lines):
+    for drawn in (
+        LineCollection(paths, linewidths=width + 1.4, color="black", alpha=0.55, **ends),
+        LineCollection(paths, linewidths=width, color=colour, **ends),
+    ):
         axes.add_collection(drawn, autolim=False)
-    return lines
 
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
@@ -667,9 +656,9 @@ class RouteCanvas:
             image.set_title(moment.title)
         else:
             show_image(image, moment.image, moment.title, "white: ahead, orange: home")
-            add_segments(image, moment.ahead[None], 1.2, color="white")
+            add_segments(image, moment.ahead[None], 1.2, "white")
             if np.isfinite(moment.beam).any():
-                add_segments(image, moment.beam[None], 2.5, color=ORANGE)
+                add_segments(image, moment.beam[None], 2.5, ORANGE)
         if moment.nearest is None:
             remembered.set_axis_off()
             remembered.set_title("Path image: not known")

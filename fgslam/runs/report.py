@@ -44,6 +44,7 @@ from fgslam.report.content import (
     TextTable,
     read_metrics,
     read_table,
+    records,
     write_csv,
 )
 from fgslam.report.formats import read_ply
@@ -68,7 +69,7 @@ from fgslam.runs.tables import (
     picture_title,
 )
 from fgslam.slam.replay import ReplayRow, peak_memory_mb
-from fgslam.slam.results import STAGES, RunRecorder, in_first_map, is_refused
+from fgslam.slam.results import STAGES, RunRecorder, in_first_map
 
 # ------------------------------------------------------------------------------------------
 # The numbers of a run, as metrics.json holds them
@@ -168,7 +169,7 @@ def frame_problems(recorder: RunRecorder) -> list[str]:
     lines = []
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
-        if is_refused(row):  # reported of all of them together
+        if row.refused:  # reported of all of them together
             continue
         if row.problem:
             lines.append(f"frame {number}: {row.problem}")
@@ -271,8 +272,7 @@ def read_closures(path: Path) -> tuple[TextTable, tuple[tuple[int, int], ...]]:
         path, (*whole, *lengths, "error_deg"), ("taken", "false"), known=whole, whole=whole
     )
     rows, closed = [], []
-    for cells in zip(*table.values(), strict=True):
-        row = dict(zip(table, cells, strict=True))
+    for row in records(table):
         if taken := row["taken"] == "true":
             closed.append((int(row["at"]), int(row["to"])))
         values = (

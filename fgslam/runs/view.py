@@ -36,6 +36,7 @@ from fgslam.report.content import (
     ON_DARK,
     level_axes,
     read_table,
+    records,
     thinned,
     world_position_covariances,
 )
@@ -227,8 +228,7 @@ def follow_rows(table: Path) -> list[Row]:
     found = read_table(
         table, (*_WHOLE, *_NUMBERS), _TEXTS, known=("image", "time_s"), whole=_WHOLE, again=again
     )
-    rows = [dict(zip(found, values, strict=True)) for values in zip(*found.values(), strict=True)]
-    if not rows:
+    if not (rows := records(found)):
         raise DatasetError(f"{table}: holds no image that was followed; {again}")
     return rows
 

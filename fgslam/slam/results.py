@@ -59,6 +59,8 @@ class FrameRow(NamedTuple):
     nis_dof: int
     stereo_precision: float
     problem: str
+    refused: bool = False
+    """An image of it was: the problem is a camera's, not a file's."""
 
 
 @dataclass(slots=True, eq=False)
@@ -126,6 +128,7 @@ def _row(report: FrameReport, stereo_precision: float) -> FrameRow:
         nis_dof=report.stats.nis_dof,
         stereo_precision=stereo_precision,
         problem=report.found.problem,
+        refused=report.found.refused,
     )
 
 
@@ -466,16 +469,11 @@ def session_remarks(
     )
 
 
-def is_refused(row: FrameRow) -> bool:
-    """Whether a camera's image was refused: its fault begins with the camera, not with a file."""
-    return row.status in ("camera_fault", "one_image") and row.problem.startswith("the ")
-
-
 def camera_remarks(recorder: RunRecorder) -> tuple[Remark, ...]:
     """One for each fault of a camera, with the frames that are not used for it."""
     frames: dict[tuple[str, str], list[int]] = {}
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
-        if is_refused(row):
+        if row.refused:
             frames.setdefault((row.status, row.problem), []).append(number)
     return tuple(
         Remark(

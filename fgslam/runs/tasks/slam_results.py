@@ -44,6 +44,7 @@ from fgslam.report.content import (
     write_metrics,
     write_timing,
 )
+from fgslam.report.overlays import draw_disparities, draw_features, draw_flow
 from fgslam.runs.config import Experiment, ExperimentConfig, parse
 from fgslam.runs.engine import LocatedShare
 from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE, METRICS_FILE
@@ -729,8 +730,6 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
     if report.found.frame is None:
         return
-    from fgslam.report.overlays import draw_disparities, draw_features, draw_flow
-
     folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
     predicted = predicted_poses(outputs.recorder.column("status").tolist())  # so far
