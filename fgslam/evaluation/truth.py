@@ -7,6 +7,7 @@ in these steps alone, and far more. Steps are wide that exceed :data:`_FAR` medi
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,14 +53,12 @@ def sound_truth(path: Trajectory, truth: Trajectory | None) -> SoundTruth:
         return SoundTruth(truth)
     words = []
     if start:
-        off = np.array([_differences(estimated[[k, start]], true[[k, start]], 1)[0]
-                        for k in range(start)]).max(axis=0)  # fmt: skip
+        off = _largest(estimated, true, [(k, start) for k in range(start)])
         first, last = rows[[0, start - 1]].tolist()
         frames = f"frame {first}" if first == last else f"frames {first} to {last}"
         words.append(f"truth of {frames} is off by {_size(off)}")
     if len(single):
-        off = np.array([_differences(estimated[[k - 1, k]], true[[k - 1, k]], 1)[0]
-                        for k in single]).max(axis=0)  # fmt: skip
+        off = _largest(estimated, true, [(k - 1, k) for k in single.tolist()])
         numbers = ", ".join(str(row) for row in rows[single].tolist())
         words.append(f"truth of single frames ({numbers}) is off by up to {_size(off)}")
     bad = np.concatenate([np.arange(start), single])
@@ -91,14 +90,27 @@ def unsound_singles(estimate: FloatArray, truth: FloatArray) -> IntArray:
 def _differences(estimate: FloatArray, truth: FloatArray, lag: int) -> FloatArray:
     """(n - lag, 2) angle in radians and distance in metres between motions over so many poses."""
     off = inverse(inverse(truth[:-lag]) @ truth[lag:]) @ inverse(estimate[:-lag]) @ estimate[lag:]
-    return np.column_stack([rotation_angles(off[:, :3, :3]), np.linalg.norm(off[:, :3, 3], axis=1)])
+    return _sizes(off)
+
+
+def _largest(
+    estimate: FloatArray, truth: FloatArray, pairs: Iterable[tuple[int, int]]
+) -> FloatArray:
+    """(2,) of the same between pairs of poses."""
+    found = [_differences(estimate[list(two)], truth[list(two)], 1)[0] for two in pairs]
+    return np.asarray(np.max(found, axis=0))
 
 
 def _bends(poses: FloatArray) -> FloatArray:
     """(n - 2, 2) by which each motion differs from the one before, angle and distance."""
     steps = inverse(poses[:-1]) @ poses[1:]
-    off = inverse(steps[:-1]) @ steps[1:]
-    return np.column_stack([rotation_angles(off[:, :3, :3]), np.linalg.norm(off[:, :3, 3], axis=1)])
+    return _sizes(inverse(steps[:-1]) @ steps[1:])
+
+
+def _sizes(motions: FloatArray) -> FloatArray:
+    """(n, 2) angle and distance of motions (n, 4, 4)."""
+    angles = rotation_angles(motions[:, :3, :3])
+    return np.column_stack([angles, np.linalg.norm(motions[:, :3, 3], axis=1)])
 
 
 def _wide(differences: FloatArray) -> BoolArray:
