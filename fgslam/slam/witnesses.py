@@ -18,8 +18,10 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import (
+    adjoint,
     compose_covariance,
     inverse,
+    motion_covariance,
     rotate_covariances,
     se3_log,
     transform_to_world,
@@ -430,37 +432,49 @@ class Witnesses:
     def spread(self, estimate: Estimate) -> Estimate:
         """The estimate with what is open between the witnesses in its covariances.
 
-        A mixture: with the odds of an episode odometry's poses are the right ones, and so is all
-        that comes after it. Where it turned out so, the frames of it are placed by its chain.
+        Where odometry turned out right, frames that followed the images are placed by its chain.
         """
         if not self.apart:
             return estimate
-        poses, covariances = estimate.trajectory.poses.copy(), estimate.covariances.copy()
-        for episode, score in enumerate(self.score):
-            frames = [one for one in self.apart if one.episode == episode]
-            odds, rows = 1.0 / (1.0 + math.exp(-score)), [one.row for one in frames]
-            if not frames:
-                continue
-            if score > _DECIDED:
-                poses[rows] = poses[rows] @ np.array([one.iTo for one in frames])
-                covariances[rows] += np.array([one.covariance for one in frames])
-                continue
-            covariances[rows] += odds * _squares(one.iTo for one in frames)
-            after = poses[rows[-1] + 1 :]
-            off = _squares(inverse(wTc) @ frames[-1].oTi @ wTc for wTc in after)
-            covariances[rows[-1] + 1 :] += odds * off
+        by_images, relative = estimate.trajectory.poses, {}
+        poses, chains = by_images.copy(), np.zeros_like(estimate.covariances)
+        episodes = np.full(len(poses), -1)
+        for one in self.apart:
+            if self.score[one.episode] > _DECIDED:
+                poses[one.row] = by_images[one.row] @ one.iTo
+                chains[one.row], episodes[one.row] = one.covariance, one.episode
+        others = self._others(by_images)
+        for lag, known in estimate.relative.items():
+            motions = inverse(poses[:-lag]) @ poses[lag:]
+            back, first, last = inverse(motions), chains[:-lag], chains[lag:]
+            one_chain = (episodes[:-lag] == episodes[lag:])[:, None, None]  # errs on from there
+            cross = one_chain * first @ np.swapaxes(adjoint(back), 1, 2)
+            chained = motion_covariance(motions, first, last, cross)
+            ways = [(p, back @ inverse(iTo[:-lag]) @ motions @ iTo[lag:]) for p, iTo in others]
+            relative[lag] = known + chained + _mixture(ways)
         trajectory = Trajectory(estimate.trajectory.timestamps, poses)
-        return replace(estimate, trajectory=trajectory, covariances=covariances)
+        covariances = estimate.covariances + chains + _mixture(others)
+        return replace(estimate, trajectory=trajectory, covariances=covariances, relative=relative)
 
     def open_covariance(self, wTc: FloatArray) -> FloatArray:
         """(6, 6) to be added to the covariance of the last pose: what is open between the two."""
-        out = np.zeros((6, 6))
-        last = {one.episode: one for one in self.apart}
-        for episode, one in last.items():
-            score = self.score[episode]
-            if score <= _DECIDED:
-                off = _squares([inverse(wTc) @ one.oTi @ wTc])[0]
-                out += off / (1.0 + math.exp(-score))
+        return _mixture(self._others(wTc[None], self._rows - 1)).reshape(6, 6)
+
+    def _others(self, poses: FloatArray, first: int = 0) -> list[tuple[float, FloatArray]]:
+        """What odometry may be right about: the odds, and from poses (n, 4, 4) to its own of them.
+
+        An episode each that has not turned to odometry; all that comes after it moves with it.
+        """
+        out = []
+        for episode, score in enumerate(self.score):
+            frames = [one for one in self.apart if one.episode == episode]
+            if frames and score <= _DECIDED:
+                iTo = inverse(poses) @ frames[-1].oTi @ poses
+                iTo[: max(frames[-1].row + 1 - first, 0)] = np.eye(4)
+                for one in frames:
+                    if one.row >= first:
+                        iTo[one.row - first] = one.iTo
+                out.append((1.0 / (1.0 + math.exp(-score)), iTo))
         return out
 
     @property
@@ -542,10 +556,13 @@ def _surprise(fits: int, of: int) -> float:
     return of * total
 
 
-def _squares(poses: Iterable[FloatArray]) -> FloatArray:
-    """(n, 6, 6) outer products of the tangent vectors of poses (n, 4, 4)."""
-    off = np.array([se3_log(one) for one in poses]).reshape(-1, 6)
-    return np.asarray(off[:, :, None] * off[:, None, :])
+def _mixture(others: Iterable[tuple[float, FloatArray]]) -> FloatArray:
+    """(n, 6, 6) of hypotheses: the odds of each, times the squares of how far (n, 4, 4) it is."""
+    total = np.zeros((6, 6))
+    for odds, motions in others:
+        off = np.array([se3_log(one) for one in motions]).reshape(-1, 6)
+        total = total + odds * off[:, :, None] * off[:, None, :]
+    return total
 
 
 def _beginning_none(tracked: Tracked, features: IntArray) -> Tracked:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from passing import PASSING_RIG, SCENE, pair_of
 
+from fgslam.core.arrays import BoolArray
 from fgslam.core.geometry import inverse, pose
 from fgslam.core.sensors import Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Estimate
 from fgslam.runs.report import located
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
@@ -54,6 +56,13 @@ def error_m(found: SessionResult, moved: Callable[[int], float] = way) -> float:
     """Of the last pose."""
     where = found.trajectory.poses[-1][:3, 3]
     return float(np.linalg.norm(where - [moved(FRAMES - 1) - moved(0), 0.0, 0.0]))
+
+
+def moved_within_3_sigma(estimate: Estimate, lag: int, true: float) -> BoolArray:
+    """(n - lag,) whether motions over so many frames are as far to the right as is true."""
+    poses = estimate.trajectory.poses
+    off = (inverse(poses[:-lag]) @ poses[lag:])[:, 0, 3] - true
+    return np.abs(off) <= 3.0 * np.sqrt(estimate.relative[lag][:, 3, 3])
 
 
 def codes(found: SessionResult) -> list[str]:
@@ -117,6 +126,8 @@ def test_a_view_filled_from_the_start_is_undecided_and_the_covariance_holds_both
         assert off > 0.4
         assert off < 3.0 * np.sqrt(np.trace(found.covariances[-1][3:, 3:]))
         assert off < 3.0 * np.sqrt(np.trace(found.online_covariances[-1][3:, 3:]))
+        estimate = session.pipeline.estimate()
+        assert all(moved_within_3_sigma(estimate, lag, 0.0).all() for lag in (1, 5))
 
 
 def test_what_passed_a_standing_robot_is_recognised_when_the_scene_is_back() -> None:
@@ -133,6 +144,10 @@ def test_what_passed_a_standing_robot_is_recognised_when_the_scene_is_back() -> 
         assert error_m(found, stands) < 0.02
         there = found.trajectory.poses[:, 0, 3]
         np.testing.assert_allclose(there[5:], way(4) - way(0), rtol=0.0, atol=0.03)
+        estimate = session.pipeline.estimate()
+        assert moved_within_3_sigma(estimate, 5, stands(9) - stands(4))[4]
+        steps = estimate.relative[1][BEGINS - 1 : BEGINS + 1, 3, 3]  # by odometry alone
+        assert (steps >= NOISE[3, 3]).all()
 
 
 def test_frozen_cameras_are_a_fault_where_odometry_has_moved() -> None:
