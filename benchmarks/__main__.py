@@ -29,6 +29,7 @@ from benchmarks.evidence import (
     light,
     noise,
     paper_views,
+    peers,
     person,
     relocalising,
     rig_honesty,
@@ -87,9 +88,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "keep", "speed", "long_drive", "soak", "ring", "sweep", *sorted(EVIDENCE))
+    names = (
+        "pages",
+        "keep",
+        "speed",
+        "long_drive",
+        "soak",
+        "ring",
+        "sweep",
+        "peers",
+        *sorted(EVIDENCE),
+    )
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
-    parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
+    parser.add_argument(
+        "path", type=Path, nargs="?", help="keep: run folder or file of --out; peers: one recording"
+    )
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     parser.add_argument("--frames", type=int, default=2000, help="speed: frames over images")
@@ -117,7 +130,9 @@ def _do(given: argparse.Namespace) -> None:
     elif given.what == "soak":
         _write_ratios(soak.traces(), given.out or Path("bench_soak.json"))
     else:
-        _print_tables(given.what, given.data, given.out)
+        own = given.what == "peers"
+        found = peers.tables(given.data, given.path) if own else EVIDENCE[given.what](given.data)
+        _print_tables(found, given.out)
 
 
 def _write_ratios(ratios: Mapping[str, float], path: Path) -> None:
@@ -125,8 +140,8 @@ def _write_ratios(ratios: Mapping[str, float], path: Path) -> None:
     parts.show(ratios)
 
 
-def _print_tables(name: str, data: Path, out: Path | None) -> None:
-    tables = tuple(EVIDENCE[name](data))
+def _print_tables(found: Iterable[Table], out: Path | None) -> None:
+    tables = tuple(found)
     sys.stdout.write("\n".join(table.markdown() for table in tables))
     if out is not None:
         _write(out, {table.title: table.as_columns() for table in tables})
