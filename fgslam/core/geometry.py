@@ -109,15 +109,16 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """Rotation matrix (3, 3) of a quaternion (x, y, z, w), normalised first."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) (x, y, z, w), normalised first."""
+    x, y, z, w = np.moveaxis(quaternion, -1, 0) / np.linalg.norm(quaternion, axis=-1)
+    rows = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return np.moveaxis(rows, (0, 1), (-2, -1))
 
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines
+from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.sides import without_side
 from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import (
@@ -150,10 +151,8 @@ def poses_of(
             f"{table.path}, line {table.lines[k]}: the quaternion has length {norms[k]:.3f}, not 1"
             f"; check the order of the columns ({' '.join(TUM_COLUMNS)})"
         )
-    from scipy.spatial.transform import Rotation  # slow to load, and few recordings have poses
-
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, :3] = rotation_from_quaternion(quaternions)
     poses[:, :3, 3] = positions
     return poses
 
@@ -189,16 +188,19 @@ def interpolate_poses(trajectory: Trajectory, at: FloatArray) -> FloatArray:
     stamps = trajectory.timestamps
     if len(at) == 0:
         return np.empty((0, 4, 4))
-    if len(stamps) == 1:
-        return np.repeat(trajectory.poses, len(at), axis=0)
-    from scipy.spatial.transform import Rotation, Slerp
-
     clipped = np.clip(at, stamps[0], stamps[-1])
-    out = np.tile(np.eye(4), (len(at), 1, 1))
-    rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
-    out[:, :3, :3] = Slerp(stamps, rotations)(clipped).as_matrix()
-    for axis in range(3):
-        out[:, axis, 3] = np.interp(clipped, stamps, trajectory.poses[:, axis, 3])
+    rows = nearest_rows(stamps, clipped)
+    out = trajectory.poses[rows]
+    between = stamps[rows] != clipped
+    if between.any():
+        from scipy.spatial.transform import Rotation, Slerp  # slow to load
+
+        rotations = Slerp(stamps, Rotation.from_matrix(trajectory.poses[:, :3, :3]))
+        out[between, :3, :3] = rotations(clipped[between]).as_matrix()
+        for axis in range(3):
+            out[between, axis, 3] = np.interp(
+                clipped[between], stamps, trajectory.poses[:, axis, 3]
+            )
     return out
 
 

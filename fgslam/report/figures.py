@@ -96,7 +96,8 @@ def scatter(
         style = {"legendgroup": group, "showlegend": False} | style
     coordinates = {axis: np.ascontiguousarray(c) for axis, c in zip("xyz", flat.T, strict=False)}
     visible = True if shown else "legendonly"
-    return kind(name=html.escape(name), visible=visible, **coordinates, **style)
+    values = {"name": html.escape(name), "visible": visible} | coordinates | style
+    return kind(values, _validate=False)
 
 
 def line(
@@ -135,9 +136,8 @@ def drawing(traces: Iterable[Any], x: str, y: str, **layout: Any) -> go.Figure:
     axes = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}}
     for name in layout.keys() & axes.keys():
         axes[name] |= layout.pop(name)
-    return go.Figure(
-        tuple(traces), {"template": TEMPLATE, "hovermode": "x unified", **axes, **layout}
-    )
+    whole = {"template": TEMPLATE, "hovermode": "x unified", **axes, **layout}
+    return go.Figure(tuple(traces), whole, _validate=False)
 
 
 def plane(
@@ -158,14 +158,21 @@ def plane(
     )
 
 
-def panels(traces: Iterable[Any], titles: Sequence[str], x: str = _SECONDS) -> go.Figure:
-    """Traces over each other in panels (``yaxis`` y, y2, ...) that share their axis of time."""
-    n, axes = len(titles), {}
-    for k, title in enumerate(titles):
+def panels(traces: Iterable[Any], titled: Mapping[str, Mapping[str, Any]]) -> go.Figure:
+    """Traces over each other in panels (``yaxis`` y, y2, ...) that share their axis of time.
+
+    Args:
+        traces: of all panels.
+        titled: title of each panel's axis of values, and how else that axis is.
+    """
+    n, axes = len(titled), {}
+    for k, (title, style) in enumerate(titled.items()):
         top, bottom = 1.0 - k / n, 1.0 - (k + 1) / n + (0.07 if k < n - 1 else 0.0)
-        axes[_panel(k, "yaxis")] = {"title": {"text": title}, "domain": [bottom, top]}
-    out = drawing(traces, x, "", xaxis={"anchor": _panel(n - 1)})
-    return out.update_layout(axes)
+        axes[_panel(k, "yaxis")] = {"title": {"text": title}, "domain": [bottom, top], **style}
+    return drawing(traces, _SECONDS, "", xaxis={"anchor": _panel(n - 1)}, **axes)
+
+
+_TO_ZERO = {"rangemode": "tozero"}
 
 
 def _panel(k: int, prefix: str = "y") -> str:
@@ -275,9 +282,19 @@ def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
                 shown=i == data.best,
             )
         )
-    axes: dict[str, Any] = {
+    scene: dict[str, Any] = {
         f"{name}axis": {"title": {"text": f"{title} (m)"}, "range": limit, "showbackground": False}
         for name, title, limit in zip("xyz", _LEVEL, limits, strict=True)
+    }
+    sides = ((high - low) / (high - low).max()).tolist()
+    scene |= {
+        "aspectmode": "manual",
+        "aspectratio": dict(zip("xyz", sides, strict=True)),
+        "camera": {
+            "eye": {"x": -0.5, "y": -1.05, "z": 0.85},
+            "center": {"x": 0, "y": 0, "z": -0.1},
+        },
+        "dragmode": "turntable",
     }
     far = f"Far landmarks outside the box, not drawn: up to {outside:,}." if outside else ""
     thinning = _thinning_note(data, detail.poses, detail.dots_map)
@@ -286,15 +303,10 @@ def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
         "The map in three dimensions",
         "Drag to turn, pinch or scroll to come closer, drag with the right button to shift. Dots: "
         "landmarks, coloured by height. Lines as above.",
-        go.Figure([*traces, *_paths(data, level, detail)], {"template": TEMPLATE}).update_scenes(
-            **axes,
-            aspectmode="manual",
-            aspectratio=dict(zip("xyz", ((high - low) / (high - low).max()).tolist(), strict=True)),
-            camera={
-                "eye": {"x": -0.5, "y": -1.05, "z": 0.85},
-                "center": {"x": 0, "y": 0, "z": -0.1},
-            },
-            dragmode="turntable",
+        go.Figure(
+            [*traces, *_paths(data, level, detail)],
+            {"template": TEMPLATE, "scene": scene},
+            _validate=False,
         ),
         note=" ".join(filter(None, [thinning, far])),
     )
@@ -522,7 +534,7 @@ def error_by_axis(data: ReportData) -> Figure:
         "Position error along the axes",
         "Estimate minus truth of the final positions, the first pose aligned. Band: three standard "
         "deviations as claimed, which should hold nearly all of it.",
-        panels(traces, [f"{name} ({unit})" for name in _LEVEL]),
+        panels(traces, {f"{name} ({unit})": {} for name in _LEVEL}),
         missing=_missing(data),
     )
 
@@ -548,7 +560,6 @@ def matches_over_time(estimator: EstimatorReport) -> Figure:
         curve(words, seconds, counts[name], colour(number), width=1.8, yaxis=axis)
         for name, (number, words, axis) in _COUNTS.items()
     ]
-    out = panels(traces, ["landmarks a frame", "landmarks in the map"])
     matched, note = counts["matched"], ""
     if len(matched):
         note = f"median {np.median(matched):.0f} matched, least {matched.min():.0f}"
@@ -556,7 +567,7 @@ def matches_over_time(estimator: EstimatorReport) -> Figure:
         "matches",
         "Matches and map",
         "Landmarks matched and used in each frame, and landmarks in the map.",
-        out.update_yaxes(rangemode="tozero"),
+        panels(traces, dict.fromkeys(("landmarks a frame", "landmarks in the map"), _TO_ZERO)),
         note=note,
     )
 
@@ -643,11 +654,8 @@ def noise_over_time(data: ReportData) -> Figure:
                     yaxis=_panel(titles.index(title)),
                 )
             )
-    out = panels(traces, titles) if titles else drawing((), _SECONDS, "")
-    for k, title in enumerate(titles):
-        spans_decades = title in (_ROTATION, _TRANSLATION)
-        axis = {"type": "log"} if spans_decades else {"rangemode": "tozero"}
-        out.update_layout({_panel(k, "yaxis"): axis})
+    decades = {title: {"type": "log"} for title in (_ROTATION, _TRANSLATION)}
+    axes = {title: decades.get(title, _TO_ZERO) for title in titles}
     has_motion = not data.estimators or {_ROTATION, _TRANSLATION} & set(titles)
     return Figure(
         "noise",
@@ -657,7 +665,7 @@ def noise_over_time(data: ReportData) -> Figure:
         "the stated deviation: of a gyroscope's turns; of matches, where a frame's pose is found; "
         "in a graph, as measurements are weighed (solid: errors that persist from frame to frame "
         "count for more) and as a single one is judged (dashed).",
-        out,
+        panels(traces, axes) if axes else drawing((), _SECONDS, ""),
         note=""
         if has_motion
         else "No noise of a motion model is shown: it estimates none, or odometry measured the "
@@ -698,7 +706,7 @@ def calibration_over_time(found: Mapping[str, FloatArray], start: float) -> Figu
         "How far the other cameras are turned and zoomed against the rig's calibration, as the "
         "drive showed it. Band: three standard deviations; where it holds zero, the calibration "
         "may be exact.",
-        panels(traces, list(_CHANGES.values())).update_yaxes(rangemode="tozero"),
+        panels(traces, dict.fromkeys(_CHANGES.values(), _TO_ZERO)),
         note=f"The rig was found to have moved {knocks} times." if knocks else "",
     )
 

@@ -88,7 +88,8 @@ def _plotly() -> tuple[str, str]:
 
 def _packed(text: str) -> str:
     """Text as gzip in base64, without a date, so that equal texts give equal bytes."""
-    content = gzip.compress(text.encode("utf-8"), compresslevel=9, mtime=0)
+    # Level 9 takes twice the time for a twenty-fifth fewer bytes.
+    content = gzip.compress(text.encode("utf-8"), compresslevel=4, mtime=0)
     return base64.b64encode(content).decode("ascii")
 
 
@@ -123,9 +124,10 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
                 opened.load()  # a truncated file is found only now
                 (width, height), kind = opened.size, opened.format
                 if len(content) > _KEPT_AS_IT_IS or kind not in ("PNG", "JPEG", "WEBP"):
-                    small, kind, out = opened.convert("RGB"), "WEBP", io.BytesIO()
-                    small.thumbnail((MAX_WIDTH, height), Image.Resampling.LANCZOS)
-                    small.save(out, format=kind, quality=_QUALITY, method=4)
+                    # WEBP takes thirty times the time for a quarter fewer bytes.
+                    small, kind, out = opened.convert("RGB"), "JPEG", io.BytesIO()
+                    small.thumbnail((MAX_WIDTH, height), Image.Resampling.BILINEAR)
+                    small.save(out, format=kind, quality=_QUALITY)
                     content = out.getvalue()
         except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
             left_out.append(f"Picture not readable: {picture.caption}")

@@ -14,7 +14,6 @@ from typing import TypeAlias
 import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
 
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_log
@@ -437,6 +436,8 @@ def _positions(landmarks: LandmarkMap, ids: IntArray) -> FloatArray:
 
 def _near(a: FloatArray, b: FloatArray, within_m: float) -> tuple[IntArray, IntArray]:
     """All pairs (k,), (k,) of rows within a distance, ascending in the first."""
+    from scipy.spatial import cKDTree  # slow to load, and few runs see a place again
+
     found = cKDTree(b).query_ball_point(a, within_m, return_sorted=True)
     counts = np.array([len(near) for near in found])
     j = np.concatenate([np.array(near, np.int64) for near in found])

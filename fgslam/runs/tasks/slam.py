@@ -220,13 +220,16 @@ def _save_progress(outputs: RunOutputs) -> EstimatorMetrics:
 
 
 def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
-    config, folder = outputs.config, outputs.folder
+    folder, output, progress = outputs.folder, outputs.config.output, context.progress
+    progress("final path", 0, 1)
     live = outputs.write_results("finished")
     about_map = _leave_map(outputs)
+    progress("final path", 1, 1)
     compared = _compare(outputs, live, context)
-    output = config.output
     if output.pictures or output.report:
+        progress("page", 0, 1)
         report_from_folder(folder, page=output.report, plan=output.pictures)
+        progress("page", 1, 1)
     result = _result(outputs, live, compared, about_map)
     if compared and context.stopped():
         return result  # the replays that are missing are for the next session

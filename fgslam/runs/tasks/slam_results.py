@@ -722,12 +722,12 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
 
 
 def frames_to_show(count: int) -> frozenset[int]:
-    """Which of ``count`` frames are drawn: the first, of which all features are, and the middle."""
+    """Which of ``count`` frames are drawn: the first and the middle."""
     return frozenset({0, count // 2})
 
 
 def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
-    """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
+    """Features (Fig. 1) of a first frame; of others disparities (Fig. 2) and flow (Fig. 3)."""
     if report.found.frame is None:
         return
     folder = make_subfolder(outputs.folder, PICTURES)
@@ -735,9 +735,10 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     predicted = predicted_poses(outputs.recorder.column("status").tolist())  # so far
     what = f"{outputs.config.name}: frame {report.increment.index}"
     title = picture_title(what, int(predicted.sum()), bool(outputs.remark))
-    if report.found.features:
+    if len(outputs.recorder.log) == 1 and report.found.features:
         draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
-    draw_disparities(folder / f"disparities_{i:06d}.png", images[0], report.stereo.pixels, title)
     if len(outputs.recorder.log) > 1:
+        pixels = report.stereo.pixels
+        draw_disparities(folder / f"disparities_{i:06d}.png", images[0], pixels, title)
         before, after = moved_pixels(*outputs.recorder.log.increments[-2:])
         draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
