@@ -13,7 +13,7 @@ from scripts.reference_settings import item, paragraph
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 _GROUPS = ("odometry", "frontend", "estimator", "compare")
 _NAMES = ("kind", "label")
-PAPER = "lab_paper"
+PAPER = "se_lowe_little_2001"
 """The experiment whose settings are its subject: the paper's own pipeline."""
 
 REASONS = {

@@ -66,6 +66,10 @@ class PerLandmarkSettings(NamedSettings):
         default="pixel",
         description="`pixel` Kalman on (c, r, d); `world` on positions (6.4); averages of 4.1",
     )
+    miss_growth_m: NonNegative = Field(
+        default=1e-4,
+        description="added to a landmark's deviation on a miss, in quadrature (6.4)",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -300,6 +300,11 @@ class HomingVectorSettings:
     confidence: float = Field(
         default=0.999, gt=0.0, lt=1.0, description="probability at which sampling stops earlier"
     )
+    inliers: Literal["epipolar", "ratio"] = Field(
+        default="epipolar",
+        description="test of a sample's support: `epipolar` against the noise of the angles; "
+        "`ratio` of the distances, as printed (III-B)",
+    )
     tilt_sigma_deg: NonNegative = Field(
         default=0.5, description="prior of the camera's roll and pitch"
     )

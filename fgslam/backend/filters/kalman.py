@@ -20,7 +20,6 @@ import numpy as np
 from fgslam.backend.considered import Moved, SampledErrors, TrackedStep, lacking, shares
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved
 from fgslam.backend.filters.landmark_update import (
-    MISS_GROWTH_M,
     FrameUpdate,
     Landmarks,
     UpdateKind,
@@ -123,7 +122,7 @@ class LandmarkKalman:
         self._errors.track(step, used, self._rows.map())
         nis = self._update_matched(used)  # type III
         missed = self._rows.rows(increment.missed_ids)  # type II
-        self._rows.covariances[missed] += MISS_GROWTH_M**2 * np.eye(3)
+        self._rows.covariances[missed] += self._settings.miss_growth_m**2 * np.eye(3)
         self._add(increment.observations.select(new), len(self._past))  # type IV
         self._record(increment, tracking, step.before, used.ids)
         self._rows.remove(increment.pruned_ids)

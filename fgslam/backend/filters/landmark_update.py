@@ -25,7 +25,6 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import CameraRig, Observations
 
 UpdateKind: TypeAlias = Literal["pixel", "world", "running_mean", "half"]
-MISS_GROWTH_M = 0.0001  # added to a landmark's deviation on a miss (6.4, which gives no number)
 
 
 class Landmarks(NamedTuple):

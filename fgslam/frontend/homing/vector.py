@@ -187,7 +187,9 @@ class HomingSearch:
             )
         )
         direction, rotation = solved.direction[solved.valid], solved.rotation[solved.valid]
-        inliers, residuals = self._test.inliers(direction, rotation, INLIER_SIGMAS, LEAST_PARALLAX)
+        inliers, residuals = self._test.inliers(
+            direction, rotation, INLIER_SIGMAS, LEAST_PARALLAX, self._settings.inliers == "ratio"
+        )
         share = self._right @ inliers / np.sum(self._right)
         return np.stack([direction, rotation, share, self._score(inliers, residuals)])
 

@@ -41,7 +41,7 @@ def test_no_experiment_tunes_what_the_defaults_settle() -> None:
 def test_a_number_that_is_tuned_to_a_recording_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     tuned = {"dataset": {"kind": "euroc"}, "frontend": {"sift": {"base_sigma_px": 2.0}}}
     others = {"dataset": {"kind": "euroc"}, "compare": [{"kind": "isam2", "gate_px": 3.0}]}
-    files = [("walk", tuned), ("flight", others), ("lab_paper", tuned)]
+    files = [("walk", tuned), ("flight", others), ("se_lowe_little_2001", tuned)]
     monkeypatch.setattr(reference_experiments, "slam_experiments", lambda: iter(files))
     assert unreasoned() == ["walk: frontend.sift.base_sigma_px", "flight: compare.gate_px"]
 

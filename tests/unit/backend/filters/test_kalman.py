@@ -22,7 +22,6 @@ from simulated import (
 )
 
 from fgslam.backend.filters.kalman import LandmarkKalman, LandmarkRows
-from fgslam.backend.filters.landmark_update import MISS_GROWTH_M
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
@@ -275,8 +274,11 @@ def test_pose_covariance_makes_observations_less_certain(
 # Laws of the covariance
 
 
-def test_a_miss_grows_the_missed_ones_by_the_stated_amount(rng: np.random.Generator) -> None:
-    estimator, _ = started(6, rng)
+@pytest.mark.parametrize("growth", [1e-4, 0.01])
+def test_a_miss_grows_the_missed_ones_by_the_stated_amount(
+    growth: float, rng: np.random.Generator
+) -> None:
+    estimator, _ = started(6, rng, miss_growth_m=growth)
     before = estimator.estimate().landmarks
     missed = frame(1, NO_IDS, np.empty((0, 3)), False, missed=np.array([1, 4]))
     estimator.update(missed, at(np.eye(4), 0))
@@ -284,7 +286,7 @@ def test_a_miss_grows_the_missed_ones_by_the_stated_amount(rng: np.random.Genera
     np.testing.assert_array_equal(after.positions, before.positions)
     grown = after.covariances - before.covariances
     for i in (1, 4):
-        np.testing.assert_allclose(grown[i], MISS_GROWTH_M**2 * np.eye(3), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(grown[i], growth**2 * np.eye(3), rtol=0, atol=1e-15)
     for i in (0, 2, 3, 5):
         np.testing.assert_array_equal(grown[i], 0.0)
 

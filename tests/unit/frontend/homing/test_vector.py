@@ -41,6 +41,7 @@ from fgslam.frontend.homing.vector import (
     estimate_homing_vector,
     match_cells,
     pair_generator,
+    re_paired,
     vector_between,
 )
 from fgslam.frontend.settings import HomingVectorSettings, OmniMatchingSettings
@@ -195,6 +196,29 @@ def test_epipolar_residual_of_truth_is_zero_and_of_unit_variance_under_noise() -
         for v in noisy
     ]
     assert np.std(residuals) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_printed_ratios_of_distances_agree_for_the_truth_and_not_for_swapped_matches() -> None:
+    exact = two_views(5, 200)
+    there = (np.array([exact.direction]), np.array([exact.rotation]))
+    test = EpipolarTest.of(exact.matches)
+    assert np.nanmax(np.abs(test.by_ratios(*there))) < 1e-6
+    good, _ = test.inliers(*there, 3.0, 0.05, printed=True)
+    assert good.all()
+    m = exact.matches
+    order = np.roll(np.arange(len(m)), 1)
+    swapped = EpipolarTest.of(re_paired(m, np.arange(len(m)), order))
+    good, _ = swapped.inliers(*there, 3.0, 0.05, printed=True)
+    assert np.mean(good) < 0.2
+
+
+def test_the_printed_test_leads_to_the_same_answer_with_a_third_of_wrong_matches() -> None:
+    view = two_views(8, 60, HALF_DEGREE, wrong_share=0.3)
+    settings = HomingVectorSettings(inliers="ratio", confidence=0.999999)
+    found = estimate_homing_vector(view.matches, settings, np.random.default_rng(0))
+    assert isinstance(found, TwoViewVector)
+    assert abs(wrap(found.direction - view.direction)) < np.deg2rad(3.0)
+    assert abs(wrap(found.rotation - view.rotation)) < np.deg2rad(3.0)
 
 
 def _hypothesis(direction: FloatArray, rotation: FloatArray) -> FloatArray:
