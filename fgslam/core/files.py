@@ -167,6 +167,12 @@ def _is_being_written(path: Path) -> bool:
     return True
 
 
+def cache_root() -> Path:
+    """``$FGSLAM_CACHE``, or ``~/.cache/fgslam``."""
+    named = os.environ.get("FGSLAM_CACHE")
+    return Path(named).expanduser() if named else Path.home() / ".cache" / "fgslam"
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file atomically. Raises OutputError when it cannot be written."""
     with replacing(path) as partial:

@@ -393,9 +393,7 @@ def across(
         seen[:, 0] += disparity
     else:
         seen[:, 1] += disparity / vertical_to_horizontal(rig)
-    correlation = np.empty(0)
-    for _ in range(ALIGNMENTS_ACROSS):
-        patches, seen, correlation = align(patches, view, seen)
+    _, seen, correlation = align(patches, view, seen, ALIGNMENTS_ACROSS)
     last = np.array([rig.width, rig.height]) - 1.0
     inside = ((seen >= 0.0) & (seen <= last)).all(axis=1)
     return seen, np.where(inside, correlation, -1.0)

@@ -256,7 +256,8 @@ def is_empty(path: Path) -> bool:
 # --------------------------------------------------------------------------------------------
 # Files of every task's run folder
 
-_VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d")
+_VERSIONS_OF = ("numpy", "scipy", "opencv-python-headless", "gtsam", "open3d", "numba")
+_PROCESSORS = ("NUMBA_CPU_NAME", "OPENBLAS_CORETYPE")  # bytes are of a kind of processor
 
 
 def write_config(folder: Path, config: Experiment, provenance: dict[str, Any]) -> None:
@@ -269,8 +270,9 @@ def write_config(folder: Path, config: Experiment, provenance: dict[str, Any]) -
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of this program, of Python and of the packages that shape the numbers."""
+    """Versions of this program, of Python and of packages, and processors chosen for these."""
     own = {"fgslam": __version__, "python": platform.python_version()}
+    own |= {name: os.environ[name] for name in _PROCESSORS if name in os.environ}
     return own | {name: _version(name) for name in _VERSIONS_OF}
 
 

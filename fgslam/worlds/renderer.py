@@ -16,7 +16,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-import os
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -30,7 +29,7 @@ import numpy.typing as npt
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.files import replacing
+from fgslam.core.files import cache_root, replacing
 from fgslam.worlds.patches import PatchArrays, RayCaster
 from fgslam.worlds.settings import LabEffectsSettings
 from fgslam.worlds.textures import TextureBank
@@ -668,12 +667,6 @@ def apply_effects(
 
 _MAGIC = b"FGSLAB1\n"
 _HEADER = struct.Struct("<8sIIII")
-
-
-def cache_root() -> Path:
-    """``$FGSLAM_CACHE``, or ``~/.cache/fgslam``."""
-    named = os.environ.get("FGSLAM_CACHE")
-    return Path(named).expanduser() if named else Path.home() / ".cache" / "fgslam"
 
 
 def content_hash(description: Mapping[str, Any]) -> str:

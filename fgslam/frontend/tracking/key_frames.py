@@ -396,7 +396,7 @@ class LandmarkCarrier:
         known, points = fresh.known, fresh.points
         old, at = patches.select(known), points.places[known]
         old = dataclasses.replace(old, maps=old.maps * fresh.growth[known, None, None])
-        old, found, correlation = _aligned(old, last, at, _FIRST_ALIGNMENTS)
+        old, found, correlation = align(old, last, at, _FIRST_ALIGNMENTS)
         alike = (correlation >= _MIN_CORRELATION) & self._inside(found, _MARGIN_PX)
         maps, places, keep = patches.maps.copy(), points.places.copy(), ~known
         maps[known], places[known] = old.maps, found
@@ -418,7 +418,7 @@ class LandmarkCarrier:
             _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
         )  # fmt: skip
         at = np.asarray(found, np.float64)
-        patches, places, correlation = _aligned(patches, now, at, _ALIGNMENTS)
+        patches, places, correlation = align(patches, now, at, _ALIGNMENTS)
         good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))
@@ -431,16 +431,6 @@ def _inside(places: FloatArray, margin: float, size: tuple[int, int]) -> BoolArr
     """Which places (n, 2) lie so far from the border of an image of this width and height."""
     last = np.array(size) - 1.0 - margin
     return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
-
-
-def _aligned(
-    patches: ReferencePatches, view: FineImage, places: FloatArray, times: int
-) -> tuple[ReferencePatches, FloatArray, FloatArray]:
-    """Patches, places and correlations after so many alignments."""
-    correlation = np.empty(0)
-    for _ in range(times):
-        patches, places, correlation = align(patches, view, places)
-    return patches, places, correlation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

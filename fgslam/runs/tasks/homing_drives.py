@@ -22,6 +22,7 @@ from fgslam.core.arrays import ByteArray, FloatArray, StateArrays
 from fgslam.core.bearings import BearingLog, HomingTruth
 from fgslam.core.errors import OutputError, StoredMapError
 from fgslam.core.geometry import between, wrap
+from fgslam.core.kernels import make_kernels
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_checked, open_house
@@ -249,6 +250,7 @@ def open_drives(config: DrivingConfig, opening: Opening) -> Task[RunResult]:
 
 def _run(config: DrivingConfig, context: Context) -> RunResult:
     """Stopped early, the drives that are done count."""
+    make_kernels(context.progress)  # before several processes do
     seeds = range(config.seed, config.seed + config.trials)
     work = partial(perform_drive, config)
     done = context.perform(("drives", "drives"), work, seeds, DrivenSeed)
@@ -576,6 +578,7 @@ def _run_video(config: OmniVideoConfig, recording: OmniRecording, context: Conte
 
     Stopped early, the frames so far count.
     """
+    make_kernels(context.progress)
     folder = context.folder
     tracker = ReplenishedTracker(recording.camera, *_POINTS)
     tracks = _Tracks()

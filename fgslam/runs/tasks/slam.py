@@ -18,6 +18,7 @@ from fgslam.core import store
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import remove_file, remove_files
+from fgslam.core.kernels import make_kernels
 from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.saved_map import save_map
 from fgslam.core.store import load_arrays, write_arrays
@@ -399,6 +400,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     if entry is not None and given is not None:
         arrival = arrival_by(entry, given, config.map)
         notes = entry_notes(entry, given, config.map)
+    make_kernels(progress)
     session = Session(
         sequence.rig,
         config.estimator,

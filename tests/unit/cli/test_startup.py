@@ -14,7 +14,7 @@ from fgslam.cli import start
 
 HEAVY = frozenset(
     {"cv2", "gtsam", "jinja2", "matplotlib", "numpy", "open3d", "pandas", "PIL", "plotly"}
-    | {"dask", "distributed", "pyarrow", "rerun", "scipy", "skimage", "yaml"}
+    | {"dask", "distributed", "llvmlite", "numba", "pyarrow", "rerun", "scipy", "skimage", "yaml"}
 )
 _RUN = """
 import contextlib, os, sys

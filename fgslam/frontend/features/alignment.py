@@ -1,0 +1,146 @@
+"""Kernel that moves and deforms patches until they fit a view: inverse compositional alignment.
+
+With b, G and M of a patch (:mod:`fgslam.frontend.features.anchoring`), and the grey values s that
+the view shows where its map A puts its pixels (Baker and Matthews 2004)::
+
+    p = sum w b s
+    (offset, gain) = (G_light + flat)^-1 p_light        light by the first look; G_light (2, 2)
+    r = (s - offset) / gain - f                         what remains;
+    sum w b r = (p - offset G_1) / gain - G_f           columns of G: no second pass over pixels
+    (t, D) = M sum w b r                                move and deformation
+    A <- A (I + D)^-1,  place <- place - A t
+    correlation = 1 / sqrt(1 + |r|^2 / |f - mean|^2)    before the move, weighted
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.kernels import Kernel
+from fgslam.frontend.features.anchoring import (
+    FLAT,
+    TERMS,
+    every_term,
+    offsets,
+    remapped,
+    sample,
+    weighted_terms,
+)
+from fgslam.frontend.features.sift import Float32
+
+_GAIN = (0.2, 5.0)  # of light against the first patch; beyond, it is another thing
+_FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or elsewhere
+
+
+def _align(  # noqa: PLR0913  kernels take plain arrays
+    grey: Any, scale: int, cut: Any, weight: Any, gram: Any, inverse: Any, times: int,
+    maps: Any, places: Any, correlation: Any, room: Any, seen: Any,
+) -> None:  # fmt: skip
+    pixels, size = len(weight), int(math.sqrt(len(weight)))
+    p, q = room[pixels], room[pixels + 1]
+    for n in range(len(cut)):
+        weighted_terms(cut, n, size, weight, room)
+        g, inv, a = gram[n], inverse[n], maps[n]
+        contrast = max(math.sqrt(max(g[1, 1] / g[0, 0] - (g[0, 1] / g[0, 0]) ** 2, 0.0)), FLAT)
+        for _ in range(times):
+            sample(grey, scale, places[n], a, size, seen)
+            square = p0 = p1 = p2 = p3 = p4 = p5 = p6 = p7 = 0.0
+            for k in range(pixels):
+                square += weight[k] * seen[k] * seen[k]
+                p0 += room[k, 0] * seen[k]
+                p1 += room[k, 1] * seen[k]
+                p2 += room[k, 2] * seen[k]
+                p3 += room[k, 3] * seen[k]
+                p4 += room[k, 4] * seen[k]
+                p5 += room[k, 5] * seen[k]
+                p6 += room[k, 6] * seen[k]
+                p7 += room[k, 7] * seen[k]
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7] = p0, p1, p2, p3, p4, p5, p6, p7
+            n00, n01, n11 = g[0, 0] + FLAT, g[0, 1], g[1, 1] + FLAT
+            det = n00 * n11 - n01 * n01
+            offset, light = (n11 * p[0] - n01 * p[1]) / det, (n00 * p[1] - n01 * p[0]) / det
+            gain = min(max(light, _GAIN[0]), _GAIN[1])
+            rest = (square - 2.0 * offset * p[0] + offset * offset * g[0, 0]) / (gain * gain)
+            rest += g[1, 1] - 2.0 * (p[1] - offset * g[0, 1]) / gain
+            unlike = math.sqrt(max(rest, 0.0) / g[0, 0]) / contrast
+            for i in range(TERMS):
+                q[i] = (p[i] - offset * g[i, 0]) / gain - g[i, 1]
+            for i in range(2, TERMS):
+                p[i] = 0.0
+                for j in range(TERMS):
+                    p[i] += inv[i, j] * q[j]
+            d00, d01, d10, d11 = 1.0 + p[4], p[5], p[6], 1.0 + p[7]
+            det = d00 * d11 - d01 * d10
+            b00, b01 = (a[0, 0] * d11 - a[0, 1] * d10) / det, (a[0, 1] * d00 - a[0, 0] * d01) / det
+            b10, b11 = (a[1, 0] * d11 - a[1, 1] * d10) / det, (a[1, 1] * d00 - a[1, 0] * d01) / det
+            x, y = -(b00 * p[2] + b01 * p[3]), -(b10 * p[2] + b11 * p[3])
+            correlation[n] = -1.0
+            if _GAIN[0] < light < _GAIN[1] and math.sqrt(x * x + y * y) < _FARTHEST_PX:
+                correlation[n] = 1.0 / math.sqrt(1.0 + unlike * unlike)
+                a[0, 0], a[0, 1], a[1, 0], a[1, 1] = b00, b01, b10, b11
+                places[n, 0] += x
+                places[n, 1] += y
+
+
+def _align_numpy(  # noqa: PLR0913
+    grey: Float32, scale: int, cut: Float32, weight: FloatArray, gram: FloatArray,
+    inverse: FloatArray, times: int, maps: FloatArray, places: FloatArray,
+    correlation: FloatArray, *rooms: Any,
+) -> None:  # fmt: skip
+    size = int(math.sqrt(len(weight)))
+    x, y = offsets(size)
+    middle = np.s_[:, 1:-1, 1:-1]
+    first_look = cut.reshape(-1, size + 2, size + 2)[middle].reshape(len(cut), -1)
+    weighted = weight * every_term(cut, size)
+    one, first = gram[:, :, 0], gram[:, :, 1]
+    total = one[:, 0]
+    contrast = np.sqrt(np.maximum(first[:, 1] / total - (one[:, 1] / total) ** 2, 0.0))
+    light = np.linalg.inv(gram[:, :2, :2] + FLAT * np.eye(2))
+    for _ in range(times):
+        columns = places[:, :1] + maps[:, 0, :1] * x + maps[:, 0, 1:] * y
+        rows = places[:, 1:] + maps[:, 1, :1] * x + maps[:, 1, 1:] * y
+        seen = remapped(grey, scale * columns, scale * rows).astype(np.float64)
+        p = (weighted @ seen[:, :, None])[:, :, 0]
+        offset, found = (light @ p[:, :2, None])[:, :, 0].T
+        gain = np.clip(found, *_GAIN)
+        rest = (seen - offset[:, None]) / gain[:, None] - first_look
+        unlike = np.sqrt((rest * rest) @ weight / total) / np.maximum(contrast, FLAT)
+        of_rest = (p - offset[:, None] * one) / gain[:, None] - first
+        change = (inverse @ of_rest[:, :, None])[:, :, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):  # crushed to nothing by one step: lost
+            moved = maps @ _inverse(np.eye(2) + change[:, 4:].reshape(-1, 2, 2))
+            move = -(moved @ change[:, 2:4, None])[:, :, 0]
+        good = (found > _GAIN[0]) & (found < _GAIN[1])
+        good &= np.hypot(move[:, 0], move[:, 1]) < _FARTHEST_PX
+        correlation[:] = np.where(good, 1.0 / np.hypot(1.0, unlike), -1.0)
+        maps[good], places[good] = moved[good], places[good] + move[good]
+
+
+def _inverse(maps: FloatArray) -> FloatArray:
+    """(n, 2, 2) inverses of matrices (n, 2, 2), whatever they are: not finite where there is none.
+
+    A patch may be crushed to nothing by one step; it is lost then, no error.
+    """
+    (a, b), (c, d) = maps[:, 0].T, maps[:, 1].T
+    out = np.empty_like(maps)
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = d, -b, -c, a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out /= (a * d - b * c)[:, None, None]
+    return out
+
+
+align_patches = Kernel(
+    _align,
+    _align_numpy,
+    "f4[:,::1] i8 f4[:,::1] f8[::1] f8[:,:,::1] f8[:,:,::1] i8 f8[:,:,::1] f8[:,::1] f8[::1] "
+    "f8[:,::1] f8[::1]",
+    sample,
+    weighted_terms,
+)
+"""(grey, scale, cut, weight (m,), gram, inverse, times, maps, places, correlation, room (m + 2, 8),
+(m,)):
+maps (n, 2, 2) and places (n, 2) after so many steps, in place, and correlations (n,)."""
