@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from fgslam.slam.feature_stream import FeatureExtractor
     from fgslam.slam.motion import MotionModel
     from fgslam.slam.results import Step
+    from fgslam.slam.rig_memory import RigMemory
     from fgslam.slam.session import NewestFrame
 
 __all__ = [
@@ -60,6 +61,7 @@ __all__ = [
     "PathMemory",
     "Refusal",
     "Result",
+    "RigMemory",
     "RouteMap",
     "Slam",
     "Step",
@@ -95,6 +97,7 @@ _HOMES = {
     "PathMemory": "fgslam.homing.route",
     "Refusal": "fgslam.core.bearings",
     "Result": "fgslam.runs.session",
+    "RigMemory": "fgslam.slam.rig_memory",
     "RouteMap": "fgslam.homing.topological_map",
     "Slam": "fgslam.runs.session",
     "Step": "fgslam.slam.results",

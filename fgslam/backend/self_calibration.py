@@ -8,7 +8,7 @@ disagree. Nothing is known of the truth. Derived in docs/derivations/cameras.md.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,15 +97,28 @@ class SelfCalibration:
     steps: Kept[list[CalibrationStep]]
     windows: Kept[int]
     knocks: Kept[int]
+    moved_before: Kept[bool]
     _since: Kept[int]
     _seen: Kept[int]
     _frames: Kept[list[tuple[FloatArray, Observations]]]
     _last_time: Kept[float | None]
 
-    def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
-        """Begins with the calibration as stated; ``pixel_sigma`` of one coordinate, pixels."""
+    def __init__(
+        self,
+        rig: CameraRig,
+        pixel_sigma: float,
+        begun: Callable[[RigUnknowns], RigFilter] | None = None,
+    ) -> None:
+        """Begins with the calibration as stated, or as earlier drives have found it.
+
+        Args:
+            rig: the cameras.
+            pixel_sigma: of one coordinate, pixels.
+            begun: gives what earlier drives have shown (:mod:`fgslam.backend.rig_memory`).
+        """
         self._unknowns = RigUnknowns(rig)
-        self._known = RigFilter.none(self._unknowns)
+        self._begun = (begun or RigFilter.none)(self._unknowns)
+        self._known = self._begun
         self._recent = []
         self.found = self._known.weighed(self._unknowns)
         """As known now, and what of it is worth applying."""
@@ -115,6 +128,8 @@ class SelfCalibration:
         """How many gave evidence."""
         self.knocks = 0
         """How often the rig was found to have moved."""
+        self.moved_before = False
+        """Whether it was found to have moved since the drives that it began with."""
         self._applied = self.found.applied.values
         self._since, self._seen = 0, 0
         self._sigma = pixel_sigma
@@ -141,6 +156,15 @@ class SelfCalibration:
         """Since when the rig is as it is now, and what no term follows."""
         return SettledRig(self.knocks, self._since, self.field_px)
 
+    def shown(self) -> tuple[FloatArray, FloatArray]:
+        """Information (n, n) and pull (n,) of the drive, without what it began with.
+
+        Of a rig that has moved, since then, with what is known of its nuisances.
+        """
+        left = self._known.remembered
+        information = self._known.information - left * self._begun.information
+        return information, self._known.pull - left * self._begun.pull
+
     def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
         if increment.relocalised:
@@ -162,7 +186,7 @@ class SelfCalibration:
             return
         self.windows += 1
         unlikely, judged = before.judged(of, evidence)
-        unlikely &= self.windows > TRUSTED_WINDOWS
+        unlikely &= self.windows > TRUSTED_WINDOWS or before.remembered > 0.0
         if unlikely:  # linearised where the window itself would go
             other = before.without_terms(of)
             evidence = alignment.evidence(other.values(of), other.precision(of)) or evidence
@@ -171,11 +195,14 @@ class SelfCalibration:
         self._known = judged.after(of, evidence)
         moved = self._moved_in()
         if moved is not None:
-            self.knocks += 1
-            self._since = self._recent[moved].first
-            (gap, _, *after), self._recent = self._recent, []
-            self._known = gap.before.without_terms(of)
-            for one in after:
+            windows, self._recent = self._recent, []
+            if moved < 0:
+                self.moved_before = True
+            else:
+                self.knocks += 1
+                self._since = windows[moved].first
+            self._known = windows[0].before.without_terms(of)
+            for one in windows[0 if moved < 0 else 2 :]:
                 self._known = self._known.judged(of, one.evidence)[1].after(of, one.evidence)
         self.found = self._held(self._known.weighed(of))
         self._applied = self.found.applied.values
@@ -186,14 +213,19 @@ class SelfCalibration:
         """In which of the two oldest recent windows the rig has moved; None: in neither.
 
         Two rigs, before and after, then explain the windows far better than one, with the same
-        nuisances; better than if it had moved later; and they differ over the whole image.
+        nuisances; better than if it had moved later; and they differ over the whole image. -1: the
+        first windows of the drive are of another rig than that which it began with.
         """
+        likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, self._unknowns.terms)
+        if self._known.remembered and len(self._recent) == self.windows:
+            move = self._moved(0)
+            if move.significance() > likely and move.rms_px() > _KNOCK_PX:
+                return -1
         if len(self._recent) < 2 + _DECIDING or not any(one.unlikely for one in self._recent):
             return None
-        of, moves = self._unknowns, [self._moved(k) for k in range(len(self._recent))]
+        moves = [self._moved(k) for k in range(len(self._recent))]
         sure = [move.significance() for move in moves]
         first = int(np.argmax(sure))
-        likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, of.terms)
         knocked = first < 2 and sure[first] > likely and moves[first].rms_px() > _KNOCK_PX
         return first if knocked else None
 
@@ -299,6 +331,7 @@ class RigFilter:
         freedom: how many numbers that is of.
         shaken: squared shifts of single frames' rows, added up, radians^2.
         frames: how many frames that is of.
+        remembered: share that is left of what the drive began with.
     """
 
     information: FloatArray
@@ -308,6 +341,7 @@ class RigFilter:
     freedom: float = 0.0
     shaken: float = 0.0
     frames: float = 0.0
+    remembered: float = 0.0
 
     @staticmethod
     def none(of: RigUnknowns) -> RigFilter:
@@ -337,7 +371,18 @@ class RigFilter:
     def faded(self, share: float) -> RigFilter:
         """The same, after a share of the time in which it is forgotten."""
         left = float(np.exp(-share))
-        return dataclasses.replace(self, information=left * self.information, pull=left * self.pull)
+        return dataclasses.replace(
+            self,
+            information=left * self.information,
+            pull=left * self.pull,
+            remembered=left * self.remembered,
+        )
+
+    def adding(self, information: FloatArray, pull: FloatArray) -> RigFilter:
+        """With evidence, as noisy as it is taken to be."""
+        return dataclasses.replace(
+            self, information=self.information + information, pull=self.pull + pull
+        )
 
     def without_terms(self, of: RigUnknowns) -> RigFilter:
         """The same of another rig in the same place: of the terms nothing is known."""
@@ -348,7 +393,7 @@ class RigFilter:
         mixed = self.information[p:, :p]
         information[p:, p:] = self.information[p:, p:] - mixed @ gain[:, :-1]
         pull[p:] = self.pull[p:] - mixed @ gain[:, -1]
-        return dataclasses.replace(self, information=information, pull=pull)
+        return dataclasses.replace(self, information=information, pull=pull, remembered=0.0)
 
     def judged(self, of: RigUnknowns, evidence: RigEvidence) -> tuple[bool, RigFilter]:
         """Whether what is known cannot explain a window; and the filter that knows its noise.
@@ -379,9 +424,7 @@ class RigFilter:
         """With the evidence of a window, and the size of the field as known then."""
         factor = self.noise_factor(of)
         added = dataclasses.replace(
-            self,
-            information=self.information + evidence.information / factor,
-            pull=self.pull + evidence.pull / factor,
+            self.adding(evidence.information / factor, evidence.pull / factor),
             shaken=self.shaken + evidence.shaken,
             frames=self.frames + evidence.frames,
         )

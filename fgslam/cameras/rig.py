@@ -72,6 +72,7 @@ class StereoRig(CameraRig):
         sources: which of a calibration file's cameras are right, left[, top].
         remarks: what the calibration gives rise to say, a line each.
         format: of the calibration's file, in words; empty where there is none.
+        file: the calibration's; empty where there is none.
 
     Raises:
         CalibrationError: a size, focal length or baseline is not positive and finite, the
@@ -85,6 +86,7 @@ class StereoRig(CameraRig):
     sources: tuple[int, ...] = (1, 0, 2)
     remarks: tuple[str, ...] = ()
     format: str = ""
+    file: str = ""
 
     def __post_init__(self) -> None:
         require_rig(self)
@@ -219,7 +221,8 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> 
         raw = replace(rectifier_of(stated, found), rig=rig)
     if unit_m != 1.0:
         rig_of(as_calibrated(rig, path))  # refuses a unit that makes one camera of two
-    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
+    remarks = implausible(str(path), rig)
+    return replace(_stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], remarks), file=str(path))
 
 
 def _stereo_rig(
@@ -586,7 +589,7 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     straight = found.order[:2] == (0, 1) and fov_deg is None and _are_rectified(chosen, turn)
     kept = None if straight and found.correction is None else found
     rig = _stereo_rig(found.rig, kept, sources, remarks)
-    return replace(rig, format=calibration.format)
+    return replace(rig, format=calibration.format, file=source)
 
 
 def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:

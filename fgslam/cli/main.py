@@ -115,6 +115,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     map_in: Path | None = None,
     map_out: Path | None = None,
     camera_out: Path | None = None,
+    rig_memory: str | None = None,
     live: bool = False,
     save_rrd: Path | None = None,
 ) -> None:
@@ -137,6 +138,8 @@ def run(  # noqa: PLR0913 - each option is a parameter
         map_in (MAP): saved map to go on with; sets map.load
         map_out (MAP): where to save the map; sets map.save
         camera_out (FILE): where to save the calibration as the drive corrected it, for --camera
+        rig_memory (off|FILE): where to keep what drives show of this calibration, with which the
+            next one begins; default: next to it, of an experiment off; sets rig_memory
         live: show the run in the rerun viewer; pip install 'fgslam[viewer]' provides it
         save_rrd (FILE.rrd): write what --live shows; needs no screen
         recording: of a recording: which frames, and how it is read
@@ -145,6 +148,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     existing = existing_folder(overwrite, resume)
     steered = {"estimator.kind": estimator, "map.load": map_in, "map.save": map_out}
+    steered["rig_memory"] = rig_memory
     settings, about = experiment_of(config, recording.camera, recording.as_overrides(steered))
     if about:
         typer.echo(about)

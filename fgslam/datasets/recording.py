@@ -65,6 +65,7 @@ class Recording(Brief):
         margins: of frames, in place of the rectifier's.
         disparity_sigma_px: noise of the disparity where a depth camera gives it, or None.
         ledger: what is taken to be so, with its source.
+        calibration: file of the rig's; empty where there is none.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Recording(Brief):
     margins: tuple[npt.NDArray[np.float32], ...] = ()
     disparity_sigma_px: float | None = None
     ledger: tuple[Entry, ...] = ()
+    calibration: str = ""
 
     @property
     def unrectified(self) -> bool:
@@ -173,6 +175,7 @@ def image_recording(
         odometry_source=odometry_source,
         rectifier=rectifier,
         ledger=ledger,
+        calibration=getattr(rig, "file", ""),
     )
 
 

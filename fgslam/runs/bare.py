@@ -130,7 +130,8 @@ def experiment_of(
     """
     path = find_experiment(given)
     if is_recording(path):
-        bare = bare_experiment(path, camera, overrides)
+        # Experiments do not depend on what other runs have left; a recording alone may.
+        bare = bare_experiment(path, camera, ("rig_memory=auto", *overrides))
         return bare.config, bare.description
     require_no_camera(path, camera)
     if not path.exists():

@@ -456,6 +456,12 @@ class ExperimentConfig(Experiment):
         description="estimators that replay the run's log: kinds, or groups as under `estimator`",
     )
     map: MapSettings = MapSettings()
+    rig_memory: str = Field(
+        default="off",
+        min_length=1,
+        description="what earlier drives have shown of the rig's calibration, which this one "
+        "begins with and adds to: `off`, a file, or `auto`: a file next to the calibration's",
+    )
     output: OutputSettings = OutputSettings()
 
     @property

@@ -139,7 +139,7 @@ TIMING_FILE = "trials_timing.csv"
 _RESULT_FILES = """
     config.yaml measurements.npz checkpoint.npz units/*.npz metrics.json timing.csv report.html
     view.rrd pictures/*.png ground_truth.tum ground_truth_landmarks.csv calibration.csv camera.json
-    loops.csv comparison.csv trials.csv trials_timing.csv map.fgmap localisation.csv
+    loops.csv comparison.csv trials.csv trials_timing.csv map.fgmap localisation.csv rig_memory.npz
     */online.tum */final.tum */covariance.csv */map.ply */frames.csv */noise.csv
     pairs.csv reference_pairs.csv links.csv estimates.csv routes.csv map.npz path_memory.npz
     frames.csv tracks.csv legs.csv commands.csv trajectory.csv logs/*.npz

@@ -48,6 +48,7 @@ from fgslam.slam.build import (
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.motion import MotionModel
 from fgslam.slam.results import SessionResult
+from fgslam.slam.rig_memory import RigMemory
 from fgslam.slam.session import Session, checked_images
 from fgslam.slam.settings import MapSettings
 
@@ -347,7 +348,7 @@ class Slam(Session):
 
     _remark = ""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - each is what a session may be given
         self,
         rig: CameraRig,
         estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
@@ -358,6 +359,7 @@ class Slam(Session):
         seed: int = 0,
         start_map: Map | MapStart | None = None,
         extend_map: bool = True,
+        rig_memory: RigMemory | None = None,
     ) -> None:
         """Begins with an empty map, or in a saved one.
 
@@ -384,9 +386,11 @@ class Slam(Session):
             start_map: where to begin, as :meth:`fgslam.Map.load` gives it; None: an empty map.
             extend_map: False leaves the map as it is, and the session only localises in it
                 (`landmark_kalman` or `ekf`).
+            rig_memory: what earlier drives have shown of the rig's calibration
+                (:class:`fgslam.RigMemory`); None: nothing.
 
         Raises:
-            CalibrationError: the rig is impossible.
+            CalibrationError: the rig is impossible, or the memory of other cameras.
             ConfigError: no such estimator, it cannot use what will be measured or begin in a map,
                 the seed is negative, or a setting of the front-end is not known or not usable.
             MapError: other cameras made the map, or it is empty.
@@ -410,6 +414,7 @@ class Slam(Session):
             features=features,
             seed=seed,
             beginning=start_map,
+            rig_memory=rig_memory,
         )
 
     @classmethod

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation import Relocaliser
+    from fgslam.slam.rig_memory import RigMemory
 
 
 def make_pipeline(
@@ -66,6 +67,7 @@ def make_pipeline(
     odometry: OdometrySettings | MotionModel,
     estimator_settings: EstimatorSettings | Estimator,
     seed: int = 0,
+    memory: RigMemory | None = None,
     arrival: Arrival | None = None,
 ) -> SlamPipeline:
     """All parts of a session for one rig.
@@ -76,6 +78,7 @@ def make_pipeline(
         odometry: settings of what predicts the motion; or what predicts it.
         estimator_settings: which estimator to make; or one already made, at its prior pose.
         seed: of place recognition's samples.
+        memory: what earlier drives have shown of the rig.
         arrival: where the run begins in a saved map; None begins with an empty one.
     """
     rig = as_measured(rig, frontend)
@@ -96,7 +99,7 @@ def make_pipeline(
         places=make_places(
             rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
         ),
-        calibration=make_calibration(rig, frontend),
+        calibration=make_calibration(rig, frontend, memory),
         key_frames=make_key_frames(rig, frontend, tracker),
         stated=np.zeros(len(term_names(rig))) if of_depth else None,
         watch=CameraWatch(rig) if frontend.watch_cameras and not of_depth else None,
@@ -283,13 +286,16 @@ def make_locator(
     return locate
 
 
-def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibration | None:
+def make_calibration(
+    rig: CameraRig, settings: FrontendSettings, memory: RigMemory | None = None
+) -> SelfCalibration | None:
     """Calibration of the rig from the drive; None where the calibration is to be taken as it is."""
     if not calibrates_itself(settings):
         return None
     from fgslam.backend.self_calibration import SelfCalibration
 
-    return SelfCalibration(rig, settings.stereo.pixel_sigma)
+    known = None if memory is None else memory.known
+    return SelfCalibration(rig, settings.stereo.pixel_sigma, known)
 
 
 def calibrates_itself(settings: FrontendSettings) -> bool:

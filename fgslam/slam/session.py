@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Condition
-from typing import Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,9 @@ from fgslam.slam.results import (
     session_remarks,
 )
 
+if TYPE_CHECKING:
+    from fgslam.slam.rig_memory import RigMemory
+
 Images: TypeAlias = Sequence[npt.ArrayLike]
 """Images (left, right[, top]) of one instant."""
 
@@ -87,6 +90,7 @@ class Session:
         features: FeatureExtractor | None = None,
         seed: int = 0,
         beginning: Arrival | MapStart | None = None,
+        rig_memory: RigMemory | None = None,
     ) -> None:
         """Begins with an empty map, or in a saved one.
 
@@ -106,6 +110,7 @@ class Session:
             seed: of everything random: samples of place recognition.
             beginning: a saved map: with the first frame's place in it, or to be located in by the
                 first frames. Those before the first one that could be located have no pose.
+            rig_memory: what earlier drives have shown of the rig's calibration; None: nothing.
 
         Raises:
             CalibrationError: the rig is impossible.
@@ -121,7 +126,7 @@ class Session:
         self.frontend = frontend
         self.numbering = (0, 1)
         chosen = chosen_estimator(estimator)
-        self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
+        self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed, rig_memory)
         self._start: MapStart | None = None
         own = is_settings(chosen) and not hasattr(odometry, "between")
         self._movable = beginning is None and own
@@ -337,6 +342,12 @@ class Session:
             why = "; ".join(filter(None, (left_out.why, self._seen.fault())))
             return f"none of {left_out.count} frames could be located in {self._map}: {why}"
         return "no frame has been tracked yet; call track first"
+
+    def remembered(self, memory: RigMemory) -> RigMemory:
+        """A memory of the rig with what this drive has shown; as it is where that is nothing."""
+        calibration = self.pipeline.calibration
+        seen = np.array([d for d in self.recorder.frame_digests if d], np.int64)
+        return memory if calibration is None else memory.after(calibration, seen)
 
     @property
     def failed(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -95,3 +96,39 @@ def test_paper_pipelines_write_no_calibration(
     assert main(monkeypatch, *arguments, "--set", "frontend.stereo.measurement=paper") == 2
     assert "takes its cameras as calibrated" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.slow
+def test_a_drive_begins_as_the_one_before_it_found_the_rig(
+    turned: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    root = Path(shutil.copytree(turned, tmp_path / "drives"))
+    quiet = ("--set", "output.pictures=false", "--overwrite", "--estimator", "landmark_kalman")
+
+    def run(name: str, *options: str) -> tuple[float, str]:
+        assert main(monkeypatch, "run", root, "--out", tmp_path / name, *quiet, *options) == 0
+        log = MeasurementLog.load(tmp_path / name / "measurements.npz")
+        roll = log.increments[0].rig_correction[term_names(log.rig).index("left.roll")]
+        return np.rad2deg(roll), " ".join(capsys.readouterr().out.split())
+
+    first, second = ("--stop", "12"), ("--start", "12")
+    assert run("a", *first)[0] == 0.0
+    (kept,) = root.glob("rig_memory_*.npz")
+    roll, said = run("b", *second)
+    assert roll == pytest.approx(ROLL_DEG, abs=0.1)
+    assert f"the calibration begins as 1 earlier drive found it ({kept})" in said
+    assert str(kept) in (tmp_path / "b" / "report.html").read_text(encoding="utf-8")
+    assert str(kept) in (tmp_path / "b" / "config.yaml").read_text(encoding="utf-8")
+    before = kept.read_bytes()
+    run("again", *second)  # without what it has shown itself
+    assert bytes_of(tmp_path / "again") == bytes_of(tmp_path / "b")
+    assert kept.read_bytes() == before
+    assert run("off", *second, "--rig-memory", "off")[0] == 0.0
+    assert kept.read_bytes() == before
+    named = tmp_path / "b" / "rig_memory.npz"  # what it began with repeats it
+    shutil.copy(named, tmp_path / "named.npz")
+    run("named", *second, "--rig-memory", str(tmp_path / "named.npz"))
+    assert bytes_of(tmp_path / "named") == bytes_of(tmp_path / "b")

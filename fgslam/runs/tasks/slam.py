@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 from fgslam.core import store
 from fgslam.core.arrays import StateArrays
-from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.errors import DatasetError, FgslamError, OutputError
 from fgslam.core.files import remove_file, remove_files
 from fgslam.core.kernels import make_kernels
 from fgslam.core.log import ImageSequence, MeasurementLog
@@ -44,14 +44,17 @@ from fgslam.runs.tables import comparison_particulars, comparison_tables, write_
 from fgslam.runs.tasks.slam_map_entry import (
     FIRST_FOLDER,
     MAP_FILE,
+    RIG_MEMORY_FILE,
     Entry,
     GivenMap,
+    GivenMemory,
     arrival_by,
     enter,
     entry_notes,
     entry_of,
     left_out_notes,
     open_map,
+    open_memory,
     require_same_map,
 )
 from fgslam.runs.tasks.slam_results import (
@@ -67,6 +70,7 @@ from fgslam.slam.build import make_estimator, make_stream, require_map_user
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder
+from fgslam.slam.rig_memory import RigMemory
 from fgslam.slam.session import Session
 from fgslam.slam.settings import MapSettings
 
@@ -224,14 +228,14 @@ def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     folder, output, progress = outputs.folder, outputs.config.output, context.progress
     progress("final path", 0, 1)
     live = outputs.write_results("finished")
-    about_map = _leave_map(outputs)
+    about_map, about_rig = _leave_map(outputs), _leave_memory(outputs)
     progress("final path", 1, 1)
     compared = _compare(outputs, live, context)
     if output.pictures or output.report:
         progress("page", 0, 1)
         report_from_folder(folder, page=output.report, plan=output.pictures)
         progress("page", 1, 1)
-    result = _result(outputs, live, compared, about_map)
+    result = _result(outputs, live, compared, about_map, about_rig)
     if compared and context.stopped():
         return result  # the replays that are missing are for the next session
     # The checkpoint goes last: while anything is left, a run goes on from its last frames.
@@ -261,6 +265,7 @@ def _result(
     live: EstimatorMetrics,
     compared: Mapping[str, Any] | None = None,
     about_map: str = "",
+    about_rig: str = "",
 ) -> SlamResult:
     """The result of an interrupted run."""
     config, compared = outputs.config, compared or {}
@@ -269,6 +274,7 @@ def _result(
         "trajectory": f"{outputs.folder / outputs.title / 'final.tum'}",
         "map": f"{outputs.folder / outputs.title / 'map.ply'}",
         "saved map": about_map,
+        "rig memory": about_rig,
         "pictures": f"{outputs.folder / PICTURES}/" if pictures else "",
     }
     tables = comparison_tables(named(config), len(outputs.recorder), compared)
@@ -287,6 +293,21 @@ def _result(
         live=live,
         pictures=pictures,
     )
+
+
+def _leave_memory(outputs: RunOutputs) -> str:
+    """Keeps what the drive has shown of the rig; a line about it, empty where it does not."""
+    memory = outputs.memory
+    if memory is None or memory.fault or not outputs.located.enough:
+        return ""
+    sequence = outputs.sequence
+    try:  # others may have driven meanwhile
+        found = RigMemory.open(memory.path, sequence.rig, getattr(sequence, "rectifier", None))
+        found = outputs.session.remembered(found)
+        found.save(memory.path)
+    except FgslamError as error:
+        return f"not kept: {error}"
+    return f"{memory.path}: what drives have shown of the calibration, with this one {len(found)}"
 
 
 def _leave_map(outputs: RunOutputs) -> str:
@@ -328,6 +349,7 @@ class OpenedRun:
         given: the map to go on with; None without one, or while it is still to be made.
         entry: how the run enters it; None where it does not, or that is not yet known.
         frames_before: selected frames before the first that shows enough to begin a map: left out.
+        memory: what earlier drives have shown of the rig; None where it does not remember.
     """
 
     config: ExperimentConfig
@@ -336,6 +358,7 @@ class OpenedRun:
     given: GivenMap | None
     entry: Entry | None
     frames_before: int = 0
+    memory: GivenMemory | None = None
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -345,6 +368,8 @@ class OpenedRun:
             out["map"] = self.entry
         if self.frames_before:
             out[_FRAMES_BEFORE] = self.frames_before
+        if self.memory is not None:
+            out["rig_memory"] = {"file": str(self.memory.path), "drives": len(self.memory.known)}
         return out
 
 
@@ -374,7 +399,8 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
     if resumed:
         known = load_config(folder / RUN_MARKER).provenance or {}
         before = int(known.get(_FRAMES_BEFORE, 0))
-    run = OpenedRun(config, folder, sequence, given, None, before)
+    memory = open_memory(config, sequence, folder if resumed else None)
+    run = OpenedRun(config, folder, sequence, given, None, before, memory)
     return dataclasses.replace(run, entry=_entry(run, given, resumed))
 
 
@@ -408,10 +434,13 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         odometry=config.odometry,
         seed=config.seed,
         beginning=arrival,
+        rig_memory=None if run.memory is None else run.memory.known,
     )
+    if run.memory is not None and not resumed:
+        run.memory.known.save(run.folder / RIG_MEMORY_FILE)
     session.recorder.left_out = run.frames_before
     first = config.dataset.start
-    outputs = RunOutputs(run.folder, run.config, sequence, session, first, notes, given)
+    outputs = RunOutputs(run.folder, run.config, sequence, session, first, notes, given, run.memory)
     if resumed:
         _load_checkpoint(run.folder, session.pipeline, session.recorder)
     return outputs

@@ -1,26 +1,31 @@
-"""The map that a run is given, and how the run enters it."""
+"""The map that a run is given, and how the run enters it; the rig's memory that it is given."""
 
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.core.errors import ConfigError, MapError
+from fgslam.backend.self_calibration import SelfCalibration
+from fgslam.core.errors import ConfigError, FgslamError, FrameError, MapError, OutputError
+from fgslam.core.files import require_output
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.types import Prediction, Relocalisation, Remark
 from fgslam.report.content import sentence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
-from fgslam.slam.build import Arrival, MapStart, make_locator, make_stream
+from fgslam.slam.build import Arrival, MapStart, calibrates_itself, make_locator, make_stream
+from fgslam.slam.rig_memory import RigMemory
 from fgslam.slam.settings import MapSettings
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"
+RIG_MEMORY_FILE = "rig_memory.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,3 +172,77 @@ def entry_of(run: Path) -> Entry | None:
             f"({type(error).__name__}: {error}); run again with --overwrite"
         ) from None
     return entry
+
+
+# ------------------------------------------------------------------------------------------
+# What earlier drives have shown of the rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenMemory:
+    """The rig's memory that a run begins with.
+
+    Attributes:
+        path: of its file, in which this drive is kept, too.
+        known: what is in there of other drives than this one.
+        fault: why this one is not kept; empty where it is.
+    """
+
+    path: Path
+    known: RigMemory
+    fault: str = ""
+
+    def notes(self, calibration: SelfCalibration | None) -> tuple[str, ...]:
+        """What was used of it, and what the drive has made of that."""
+        notes = []
+        if count := len(self.known):
+            drives = f"{count} earlier drive{'s' * (count > 1)}"
+            known = f"as {drives} found it ({self.path})"
+            notes.append(f"the calibration begins {known}; --rig-memory off leaves that out")
+        if calibration is not None and calibration.moved_before:
+            notes.append("the cameras have moved since those drives, which therefore are left out")
+        if self.fault:
+            notes.append(f"what this drive shows of the calibration is not kept: {self.fault}")
+        return tuple(notes)
+
+
+def open_memory(
+    config: ExperimentConfig, sequence: ImageSequence, resumed: Path | None
+) -> GivenMemory | None:
+    """The memory of a recording's rig, without the recording itself; None where it has none.
+
+    ``resumed``: folder of the run that goes on, with what it began with.
+
+    Raises:
+        CalibrationError: the file that is named is none, or of another calibration.
+        OutputError: it cannot be written.
+        ConfigError: it is to lie next to a calibration that is in no file.
+    """
+    where, rig = config.rig_memory, sequence.rig
+    if where == "off" or not calibrates_itself(config.frontend):
+        return None
+    rectifier, path, fault = getattr(sequence, "rectifier", None), Path(where), ""
+    known = RigMemory.of(rig, rectifier)
+    if where == "auto":
+        files = getattr(sequence, "calibration", ""), getattr(config.dataset, "path", "")
+        file = next((Path(name) for name in files if name and Path(name).exists()), None)
+        if file is None:
+            raise ConfigError("rig_memory: no file holds the calibration; give a file, or off")
+        folder = file if file.is_dir() else file.parent
+        path = folder / f"rig_memory_{known.calibration}.npz"
+    try:
+        known = RigMemory.open(path, rig, rectifier)
+        require_output(path, overwrite=True)
+        if not path.parent.stat().st_mode & 0o222:  # which does not stop root
+            raise OutputError(f"{path.parent} is read-only; --rig-memory FILE keeps it elsewhere")
+    except FgslamError as error:
+        if where != "auto":
+            raise
+        fault = str(error)
+    if resumed is not None:
+        known = RigMemory.open(resumed / RIG_MEMORY_FILE, rig, rectifier)
+    seen = []
+    for i in {0, len(sequence) // 2, len(sequence) - 1}:
+        with suppress(FrameError):
+            seen.append(sequence.frame(i).digest())
+    return GivenMemory(path, known.without(np.array(seen, np.int64)), fault)

@@ -70,7 +70,7 @@ from fgslam.runs.tables import (
     write_frames,
     write_noise,
 )
-from fgslam.runs.tasks.slam_map_entry import GivenMap
+from fgslam.runs.tasks.slam_map_entry import GivenMap, GivenMemory
 from fgslam.slam.build import calibrates_itself
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import (
@@ -506,6 +506,7 @@ class RunOutputs:
         first_frame: number in the recording of the sequence's frame 0.
         notes: what is to be reported of the run, besides the recording's own.
         given: the map that it goes on with; None without one.
+        memory: what earlier drives have shown of the rig; None where it does not remember.
     """
 
     folder: Path
@@ -515,6 +516,7 @@ class RunOutputs:
     first_frame: int = 0
     notes: tuple[str, ...] = ()
     given: GivenMap | None = None
+    memory: GivenMemory | None = None
 
     @property
     def pipeline(self) -> SlamPipeline:
@@ -629,6 +631,7 @@ class RunOutputs:
         return (
             *self.sequence.notes,
             *self.notes,
+            *(() if self.memory is None else self.memory.notes(self.pipeline.calibration)),
             *map(sentence, session_remarks(self.pipeline, self.recorder)),
         )
 
