@@ -16,7 +16,7 @@ _NEAREST_M = 0.2
 def visible(rig: CameraRig, points: FloatArray) -> BoolArray:
     """Which points (n, 3) in the camera's frame are in front and inside the reference image."""
     front = points[:, 2] > _NEAREST_M
-    measured = g.project(rig, np.where(front[:, None], points, 1.0))
+    measured = rig.predict(np.where(front[:, None], points, 1.0))
     low = _BORDER_PX
     high = np.array([rig.width, rig.height]) - 1 - _BORDER_PX
     inside = ((measured[:, :2] > low) & (measured[:, :2] < high)).all(axis=1)
@@ -61,7 +61,7 @@ class FeatureWorld:
         if hidden is not None:
             shown[hidden] = False
         which = np.flatnonzero(shown)
-        column, row, disparity = g.project(self._rig, local[which]).T
+        column, row, disparity = self._rig.predict(local[which]).T
         places = [(column, row), (column + disparity, row)]
         if self._rig.vertical_baseline is not None:
             ratio = self._rig.vertical_baseline / self._rig.baseline

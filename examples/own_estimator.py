@@ -12,7 +12,7 @@ import numpy as np
 import fgslam as fg
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import transform_to_world, triangulate, triangulation_covariance
+from fgslam.core.geometry import transform_to_world
 from fgslam.core.sensors import CameraRig, Increment, MeasurementType
 from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 
@@ -51,8 +51,8 @@ class FirstSight:
         seen = increment.observations
         new = seen.select(seen.is_new)
         turned = tracking.wTc[:3, :3]
-        local = triangulation_covariance(self.rig, new.measurement, new.covariance)
-        points = transform_to_world(tracking.wTc, triangulate(self.rig, new.measurement))
+        local = self.rig.triangulation_covariance(new.measurement, new.covariance)
+        points = transform_to_world(tracking.wTc, self.rig.triangulate(new.measurement))
         # Identities of new landmarks are higher than all before: they stay in ascending order.
         self.map = LandmarkMap(
             np.concatenate([self.map.ids, new.ids]),

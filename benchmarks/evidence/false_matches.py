@@ -19,7 +19,7 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.geometry import inverse, project, transform_to_camera
+from fgslam.core.geometry import inverse, transform_to_camera
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import StereoFeatures
 from fgslam.datasets.rendered import RenderedLabSequence
@@ -189,5 +189,5 @@ def _apart(rig: CameraRig, a: FloatArray, b: FloatArray) -> FloatArray:
     """Distances (n,) of points (n, 3) in (column, row, disparity); infinite behind the camera."""
     away = np.full(len(a), np.inf)
     seen = a[:, 2] > _NEAREST_M
-    away[seen] = np.linalg.norm(project(rig, a[seen]) - project(rig, b[seen]), axis=1)
+    away[seen] = np.linalg.norm(rig.predict(a[seen]) - rig.predict(b[seen]), axis=1)
     return away

@@ -24,15 +24,7 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.geometry import (
-    KERNEL,
-    GaussNewton,
-    Linearised,
-    inverse_spd3,
-    project,
-    projection_jacobian,
-    triangulate,
-)
+from fgslam.core.geometry import KERNEL, GaussNewton, Linearised, inverse_spd3
 from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.threads import one_blas_thread
 from fgslam.runs.config import ExperimentConfig
@@ -132,12 +124,12 @@ def coordinate_error_px(
     def residuals(places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of landmarks' places: points in their cameras, residuals, and squares in sigmas."""
         here = np.einsum("nji,nj->ni", wTc[:, :3, :3], places[landmark] - wTc[:, :3, 3])
-        rest = project(rig, here) - seen.measurement
+        rest = rig.predict(here) - seen.measurement
         return here, rest, np.einsum("ni,nij,nj->n", rest, weight, rest)
 
     def linearised(places: FloatArray, _: int) -> Linearised:
         here, rest, squares = residuals(places)
-        slope = projection_jacobian(rig, here) @ wTc[:, :3, :3].swapaxes(1, 2)
+        slope = rig.jacobian(here) @ wTc[:, :3, :3].swapaxes(1, 2)
         robust = weight / (1.0 + squares / KERNEL**2)[:, None, None]
         weighted = slope.swapaxes(1, 2) @ robust
         hessian, gradient = np.zeros((len(first), 3, 3)), np.zeros((len(first), 3))
@@ -145,7 +137,7 @@ def coordinate_error_px(
         np.add.at(gradient, landmark, (weighted @ rest[:, :, None])[:, :, 0])
         return hessian, gradient
 
-    start = triangulate(rig, seen.measurement[first])
+    start = rig.triangulate(seen.measurement[first])
     start = np.einsum("nij,nj->ni", wTc[first, :3, :3], start) + wTc[first, :3, 3]
     _, rest, squares = residuals(_FIT.minimise(start, linearised))
     return float(np.sqrt(np.mean(rest[squares < _FARTHEST_SIGMAS**2, :2] ** 2)))

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.runs import DATA, EXPERIMENTS, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.geometry import inverse, project, transform_to_camera
+from fgslam.core.geometry import inverse, transform_to_camera
 from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import LandmarkAppearances, LandmarkMap, StereoFeatures
@@ -171,7 +171,7 @@ def _before(rig: CameraRig, wTc: FloatArray, landmarks: LandmarkMap) -> BoolArra
     """Which landmarks lie in the image and its border, hidden ones too."""
     points = transform_to_camera(wTc, landmarks.positions)
     ahead = points[:, 2] > _NEAREST_M
-    column, row, _ = project(rig, np.where(ahead[:, None], points, [0.0, 0.0, 1.0])).T
+    column, row, _ = rig.predict(np.where(ahead[:, None], points, [0.0, 0.0, 1.0])).T
     inside = (column > -_BORDER_PX) & (column < rig.width + _BORDER_PX)
     inside &= (row > -_BORDER_PX) & (row < rig.height + _BORDER_PX)
     return np.asarray(ahead & inside)

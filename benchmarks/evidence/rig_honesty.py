@@ -77,7 +77,7 @@ def road(
     for k in range(frames):
         local = g.transform_to_camera(wTc, points)
         ids = np.flatnonzero((local[:, 2] > _NEAR_M) & (local[:, 2] < _FAR_M))
-        exact = g.project(RIG, local[ids])
+        exact = RIG.predict(local[ids])
         at = (exact @ model.T).reshape(-1, 2, 2)
         inside = ((at >= 0.0) & (at < size)).all(axis=(1, 2))
         ids, exact, at = ids[inside], exact[inside], at[inside]

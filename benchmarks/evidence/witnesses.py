@@ -17,15 +17,8 @@ import fgslam as fg
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.geometry import (
-    compose_odometry,
-    inverse,
-    pose,
-    rotation_angle,
-    se3_exp,
-    so3_exp,
-)
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.geometry import inverse, pose, rotation_angle, se3_exp, so3_exp
+from fgslam.core.sensors import CameraRig, Odometry, compose_odometry
 from fgslam.core.types import Remark
 from fgslam.runs.report import located
 from fgslam.slam.session import Session

@@ -158,14 +158,14 @@ class Walk:
             descriptors=np.concatenate(
                 [seen.descriptors[own], rng.integers(130, 255, new).astype(np.uint8)]
             ),
-            position=g.triangulate(RIG, measured),
-            position_covariance=g.triangulation_covariance(RIG, measured, covariance),
+            position=RIG.triangulate(measured),
+            position_covariance=RIG.triangulation_covariance(measured, covariance),
             pixels=np.full((len(measured), 3, 2), np.nan),
         )
 
     def _take(self, new: Observations, wTc: FloatArray) -> None:
         """New landmarks enter the map where they were measured."""
-        points = g.transform_to_world(wTc, g.triangulate(RIG, new.measurement))
+        points = g.transform_to_world(wTc, RIG.triangulate(new.measurement))
         self.map = LandmarkMap(
             np.concatenate([self.map.ids, new.ids]),
             np.concatenate([self.map.positions, points]),

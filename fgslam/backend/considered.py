@@ -47,10 +47,8 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     point_pose_jacobian,
-    projection_jacobian,
     skew,
     transform_to_camera,
-    triangulate,
 )
 from fgslam.core.sensors import (
     CameraRig,
@@ -332,8 +330,8 @@ class _Linearised(Rows):
 
     @staticmethod
     def of(rig: CameraRig, terms: RigTerms, seen: Observations, wTc: FloatArray) -> _Linearised:
-        points = triangulate(rig, seen.measurement)
-        projection = projection_jacobian(rig, points)
+        points = rig.triangulate(seen.measurement)
+        projection = rig.jacobian(points)
         by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
         by_point = projection @ wTc[:3, :3].T
         shift = terms.shifts(seen.measurement)
@@ -648,7 +646,7 @@ class SampledErrors(ErrorColumns):
     def linearised(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
         """Matches of a frame at ``wTc``, with the columns of the measurements' errors."""
         points = transform_to_camera(wTc, seen.points)
-        projection = projection_jacobian(self._sensor, points)
+        projection = self._sensor.jacobian(points)
         shift = np.zeros((len(seen), 3, self._count + SAMPLES))
         shift[:, :, : self._count] = self._terms.shifts(seen.measurement)
         shift[:, :, self._count :] = self._drawn(self._noise.power * seen.measurement_covariance)

@@ -14,15 +14,7 @@ import numpy as np
 
 from fgslam.backend.open_tracks import LONGEST, OpenTracks, Tracks, tracks_of
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
-from fgslam.core.geometry import (
-    in_front,
-    inverse,
-    inverse_spd3,
-    project,
-    projection_jacobian,
-    reorthonormalise,
-    triangulate,
-)
+from fgslam.core.geometry import in_front, inverse, inverse_spd3, reorthonormalise
 from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion
@@ -231,7 +223,7 @@ class _Sightings:
     def fitted(self, sensor: CameraRig) -> Fitted | None:
         """With each landmark where its sightings have it; without those that hold a wrong match."""
         last = self.tracks.start + self.tracks.counts - 1
-        local = triangulate(sensor, self.measurement[last])
+        local = sensor.triangulate(self.measurement[last])
         wTc = inverse(self.cTw[last])
         places = np.einsum("mij,mj->mi", wTc[:, :3, :3], local) + wTc[:, :3, 3]
         found = self
@@ -257,8 +249,8 @@ class _Sightings:
 
     def _linear(self, sensor: CameraRig, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normalised residuals (n, 3) and their derivative (n, 3, 3) by the place."""
-        off = self.measurement - project(sensor, points)
-        jacobian = projection_jacobian(sensor, points) @ self.cTw[:, :3, :3]
+        off = self.measurement - sensor.predict(points)
+        jacobian = sensor.jacobian(points) @ self.cTw[:, :3, :3]
         return np.einsum("nij,nj->ni", self.whitening, off), self.whitening @ jacobian
 
     def _step(self, residual: FloatArray, jacobian: FloatArray, weight: FloatArray) -> FloatArray:

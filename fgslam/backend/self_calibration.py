@@ -27,14 +27,7 @@ from fgslam.core.correction import (
     prior_information,
     term_names,
 )
-from fgslam.core.geometry import (
-    in_front,
-    moved_apart,
-    point_pose_jacobian,
-    project,
-    projection_jacobian,
-    triangulate,
-)
+from fgslam.core.geometry import in_front, moved_apart, point_pose_jacobian
 from fgslam.core.sensors import (
     CameraRig,
     Increment,
@@ -668,7 +661,7 @@ class RigAlignment:
         self._keep(self._measured(rig)[:, 2] > _LEAST_DISPARITY_PX)
         if not self._first.size:
             return None
-        local = triangulate(self._rig, self._measured(rig)[self._first])
+        local = self._rig.triangulate(self._measured(rig)[self._first])
         turn, place = self._poses[:, :3, :3], self._poses[:, :3, 3]
         at = self._frame[self._first]
         points = np.einsum("lij,lj->li", turn[at], local) + place[at]
@@ -705,7 +698,7 @@ class RigAlignment:
             return self._last
         local = self._local(state)
         safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
-        exact = project(self._rig, safe) @ self._model.T
+        exact = self._rig.predict(safe) @ self._model.T
         pixels = exact.reshape(-1, self._rig.cameras, 2)
         unit = self._of.displacements(pixels)
         shaken = unit[:, :, self._shaken]
@@ -744,7 +737,7 @@ class RigAlignment:
         state, local, residual = found.state, found.local, found.residual
         squared = (residual**2).sum(axis=1)
         root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))[:, None, None]
-        by_local = root * (self._white @ self._model @ projection_jacobian(self._rig, local))
+        by_local = root * (self._white @ self._model @ self._rig.jacobian(local))
         by_pose = by_local @ point_pose_jacobian(local)
         by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
         of_pixels = root * (self._white @ np.concatenate([found.shaken, found.unit], axis=2))
@@ -849,11 +842,11 @@ class RigChange:
         turn, place = poses[:, :3, :3], poses[:, :3, 3]
         local = np.einsum("kji,kj->ki", turn, positions - place)
         ahead = in_front(local)
-        before = project(self.rig, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+        before = self.rig.predict(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
         after = self.measured(before)
         size = np.array([self.rig.width, self.rig.height])
         seen = ahead & ((before[:, :2] >= 0.0) & (before[:, :2] < size)).all(axis=1)
         seen &= after[:, 2] > _LEAST_SHARE * before[:, 2]
-        again = triangulate(self.rig, np.where(seen[:, None], after, before))
+        again = self.rig.triangulate(np.where(seen[:, None], after, before))
         again = np.einsum("kij,kj->ki", turn, again) + place
         return np.where(seen[:, None], again, positions)

@@ -8,7 +8,7 @@ Functions over many items are vectorised over the leading axis.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias, TypeVar
 
@@ -17,7 +17,6 @@ from numpy.linalg import LinAlgError
 
 from fgslam.core.arrays import BoolArray, FloatArray, middle
 from fgslam.core.errors import EstimatorError
-from fgslam.core.sensors import CameraRig, Odometry
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -224,16 +223,6 @@ def motion_covariance(
     return np.asarray(0.5 * (found + np.swapaxes(found, -1, -2)))
 
 
-def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
-    """Consecutive independent steps as one; measured, or else turned, if all of them are so."""
-    motion, covariance, measured, turned = np.eye(4), np.zeros((6, 6)), True, True
-    for step in steps:
-        covariance = compose_covariance(step.motion, covariance, step.covariance)
-        motion = motion @ step.motion
-        measured, turned = measured and step.measured, turned and (step.measured or step.turned)
-    return Odometry(motion, covariance, measured, turned and not measured)
-
-
 def is_rigid(matrix: FloatArray) -> bool:
     """Whether the matrix is a finite rigid motion (4, 4)."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -244,12 +233,6 @@ def is_rigid(matrix: FloatArray) -> bool:
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
     right_handed = np.linalg.det(rotation) > 0.0
     return bool(orthonormal and right_handed and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]))
-
-
-def odometry_of_camera(body: Odometry, bTc: FloatArray) -> Odometry:
-    """Odometry of the robot's body as that of its camera, by the lever arm (Se et al. 5)."""
-    motion = body_to_camera_motion(body.motion, bTc)
-    return Odometry(motion, change_tangent_frame(inverse(bTc), body.covariance))
 
 
 def change_tangent_frame(aTb: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -308,69 +291,11 @@ def in_front(points: FloatArray, nearest_m: float = 1e-3) -> BoolArray:
     return np.asarray(points[:, 2] > nearest_m)
 
 
-def project(rig: CameraRig, points: FloatArray) -> FloatArray:
-    """(column, row, disparity) (n, 3) of points (n, 3) before the reference camera."""
-    inverse_depth = 1.0 / points[:, 2]
-    out = np.empty_like(points)
-    out[:, 0] = rig.cx + rig.fx * points[:, 0] * inverse_depth
-    out[:, 1] = rig.cy + rig.fy * points[:, 1] * inverse_depth
-    out[:, 2] = rig.fx * rig.baseline * inverse_depth
-    return out
-
-
-def projection_jacobian(rig: CameraRig, points: FloatArray) -> FloatArray:
-    """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the camera's frame."""
-    inverse_depth = 1.0 / points[:, 2]
-    inverse_depth2 = inverse_depth * inverse_depth
-    out = np.zeros((len(points), 3, 3))
-    out[:, 0, 0] = rig.fx * inverse_depth
-    out[:, 0, 2] = -rig.fx * points[:, 0] * inverse_depth2
-    out[:, 1, 1] = rig.fy * inverse_depth
-    out[:, 1, 2] = -rig.fy * points[:, 1] * inverse_depth2
-    out[:, 2, 2] = -rig.fx * rig.baseline * inverse_depth2
-    return out
-
-
 def point_pose_jacobian(points: FloatArray) -> FloatArray:
     """d(point in camera)/d(tangent of wTc) (n, 3, 6) for points (n, 3) in the camera's frame."""
     out = np.empty((len(points), 3, 6))
     out[:, :, :3], out[:, :, 3:] = skew(points), -_EYE3
     return out
-
-
-def triangulate(rig: CameraRig, measurement: FloatArray) -> FloatArray:
-    """Points (n, 3) in the camera's frame from measurements (n, 3); inverse of :func:`project`.
-
-    The disparity must be positive (Se et al. 2.2).
-    """
-    depth = rig.fx * rig.baseline / measurement[:, 2]
-    out = np.empty(measurement.shape)
-    out[:, 0] = (measurement[:, 0] - rig.cx) * depth / rig.fx
-    out[:, 1] = (measurement[:, 1] - rig.cy) * depth / rig.fy
-    out[:, 2] = depth
-    return out
-
-
-def triangulation_covariance(
-    rig: CameraRig, measurement: FloatArray, covariance: FloatArray
-) -> FloatArray:
-    """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
-
-    Keeps the off-diagonals, so that the ellipsoids lie along the rays.
-
-    Args:
-        rig: the cameras.
-        measurement: (n, 3) column, row, disparity, pixels.
-        covariance: (n, 3, 3) of the measurement, pixels squared.
-    """
-    d, fx, fy, baseline = measurement[:, 2], rig.fx, rig.fy, rig.baseline
-    jacobian = np.zeros((len(d), 3, 3))
-    jacobian[:, 0, 0] = baseline / d
-    jacobian[:, 0, 2] = -(measurement[:, 0] - rig.cx) * baseline / d**2
-    jacobian[:, 1, 1] = fx * baseline / (fy * d)
-    jacobian[:, 1, 2] = -(measurement[:, 1] - rig.cy) * fx * baseline / (fy * d**2)
-    jacobian[:, 2, 2] = -fx * baseline / d**2
-    return congruence(jacobian, covariance)
 
 
 def congruence(a: FloatArray, s: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ Derived in docs/derivations/measurements.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import lru_cache
@@ -15,6 +15,13 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
 from fgslam.core.errors import ConfigError
+from fgslam.core.geometry import (
+    body_to_camera_motion,
+    change_tangent_frame,
+    compose_covariance,
+    congruence,
+    inverse,
+)
 from fgslam.core.settings import RigPlaces
 
 # ------------------------------------------------------------------------------------------
@@ -80,6 +87,22 @@ class Odometry(Brief):
         motion, full = np.eye(4), np.diag(np.repeat([0.0, FREE_TRANSLATION_M**2], 3))
         motion[:3, :3], full[:3, :3] = rotation, covariance
         return Odometry(motion, full, measured=False, turned=True, bias=bias)
+
+
+def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
+    """Consecutive independent steps as one; measured, or else turned, if all of them are so."""
+    motion, covariance, measured, turned = np.eye(4), np.zeros((6, 6)), True, True
+    for step in steps:
+        covariance = compose_covariance(step.motion, covariance, step.covariance)
+        motion = motion @ step.motion
+        measured, turned = measured and step.measured, turned and (step.measured or step.turned)
+    return Odometry(motion, covariance, measured, turned and not measured)
+
+
+def odometry_of_camera(body: Odometry, bTc: FloatArray) -> Odometry:
+    """Odometry of the robot's body as that of its camera, by the lever arm (Se et al. 5)."""
+    motion = body_to_camera_motion(body.motion, bTc)
+    return Odometry(motion, change_tangent_frame(inverse(bTc), body.covariance))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -258,6 +281,61 @@ class CameraRig(Brief):
         fTc = np.eye(4)
         fTc[0, 3] = self.baseline if frame == "left" else 0.0
         return fTc
+
+    # -- what the rig measures of points in the reference camera's frame: a landmark model -----
+
+    def predict(self, points: FloatArray) -> FloatArray:
+        """(column, row, disparity) (n, 3) of points (n, 3) before the reference camera."""
+        inverse_depth = 1.0 / points[:, 2]
+        out = np.empty_like(points)
+        out[:, 0] = self.cx + self.fx * points[:, 0] * inverse_depth
+        out[:, 1] = self.cy + self.fy * points[:, 1] * inverse_depth
+        out[:, 2] = self.fx * self.baseline * inverse_depth
+        return out
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """(n, 3, 3) derivatives of :meth:`predict` by the points."""
+        inverse_depth = 1.0 / points[:, 2]
+        inverse_depth2 = inverse_depth * inverse_depth
+        out = np.zeros((len(points), 3, 3))
+        out[:, 0, 0] = self.fx * inverse_depth
+        out[:, 0, 2] = -self.fx * points[:, 0] * inverse_depth2
+        out[:, 1, 1] = self.fy * inverse_depth
+        out[:, 1, 2] = -self.fy * points[:, 1] * inverse_depth2
+        out[:, 2, 2] = -self.fx * self.baseline * inverse_depth2
+        return out
+
+    def triangulate(self, measurement: FloatArray) -> FloatArray:
+        """Points (n, 3) in the camera's frame from measurements (n, 3); undoes :meth:`predict`.
+
+        The disparity must be positive (Se et al. 2.2).
+        """
+        depth = self.fx * self.baseline / measurement[:, 2]
+        out = np.empty(measurement.shape)
+        out[:, 0] = (measurement[:, 0] - self.cx) * depth / self.fx
+        out[:, 1] = (measurement[:, 1] - self.cy) * depth / self.fy
+        out[:, 2] = depth
+        return out
+
+    def triangulation_covariance(
+        self, measurement: FloatArray, covariance: FloatArray
+    ) -> FloatArray:
+        """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
+
+        Keeps the off-diagonals, so that the ellipsoids lie along the rays.
+
+        Args:
+            measurement: (n, 3) column, row, disparity, pixels.
+            covariance: (n, 3, 3) of the measurement, pixels squared.
+        """
+        d, fx, fy, baseline = measurement[:, 2], self.fx, self.fy, self.baseline
+        jacobian = np.zeros((len(d), 3, 3))
+        jacobian[:, 0, 0] = baseline / d
+        jacobian[:, 0, 2] = -(measurement[:, 0] - self.cx) * baseline / d**2
+        jacobian[:, 1, 1] = fx * baseline / (fy * d)
+        jacobian[:, 1, 2] = -(measurement[:, 1] - self.cy) * fx * baseline / (fy * d**2)
+        jacobian[:, 2, 2] = -fx * baseline / d**2
+        return congruence(jacobian, covariance)
 
 
 CAMERA_NAMES = ("right", "left", "top")

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import FrameError, OdometryError
-from fgslam.core.geometry import so3_log, triangulate
+from fgslam.core.geometry import so3_log
 from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.datasets.odometry import OdometrySource
 from fgslam.datasets.recording import Recording
@@ -229,7 +229,7 @@ def stereo_features(rig: CameraRig, right: Found, left: Found) -> FrameFeatures:
     disparity = left[0][partners, 0] - right[0][rows, 0]
     level = np.abs(left[0][partners, 1] - right[0][rows, 1]) < _INLIER_PX
     good = level & (disparity > 1.0)
-    points[rows[good]] = triangulate(rig, np.column_stack([right[0][rows], disparity])[good])
+    points[rows[good]] = rig.triangulate(np.column_stack([right[0][rows], disparity])[good])
     return FrameFeatures(*right, points)
 
 

@@ -16,7 +16,7 @@ from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry, PoseFrame
+from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, compose_odometry
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.recording import select_frames
@@ -177,7 +177,7 @@ class RenderedLabSequence:
         first = self._index(i - 1)
         if not self._drive.driven[first:last].all():
             return None
-        return geometry.compose_odometry(self._odometry[first:last])
+        return compose_odometry(self._odometry[first:last])
 
     @property
     def ground_truth(self) -> Trajectory:

@@ -13,12 +13,7 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.geometry import (
-    in_front,
-    project,
-    projection_jacobian,
-    skew,
-)
+from fgslam.core.geometry import in_front, skew
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.noise import Whitening
 
@@ -128,7 +123,7 @@ def linearised(
     """
     local = in_cameras(poses, points)
     off, seen = _off(rig, local, measurement)
-    jacobian = roots @ projection_jacobian(rig, np.where(seen[:, None], local, 1.0))
+    jacobian = roots @ rig.jacobian(np.where(seen[:, None], local, 1.0))
     jacobian[~seen] = 0.0
     by_pose = np.empty((len(local), 3, 6))
     by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
@@ -141,7 +136,7 @@ def _off(
 ) -> tuple[FloatArray, BoolArray]:
     """Residuals (k, 3) of points in the camera's frame, and which are in front (k,)."""
     seen = in_front(local)
-    predicted = project(rig, np.where(seen[:, None], local, 1.0))
+    predicted = rig.predict(np.where(seen[:, None], local, 1.0))
     off = predicted - measurement
     # As GTSAM's factor has it: both columns and the row are two focal lengths off.
     off[~seen] = [2.0 * rig.fx, 2.0 * rig.fx, 0.0]

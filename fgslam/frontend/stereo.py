@@ -14,7 +14,6 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.correction import RigCorrection
-from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.log import Frame, clearance
 from fgslam.core.sensors import (
     UNKNOWN_DISPARITY_PX,
@@ -137,8 +136,8 @@ class StereoMatcher:
             scale=found.scale,
             orientation=found.orientation,
             descriptors=found.descriptors,
-            position=triangulate(self._rig, measurement),
-            position_covariance=triangulation_covariance(self._rig, measurement, covariance),
+            position=self._rig.triangulate(measurement),
+            position_covariance=self._rig.triangulation_covariance(measurement, covariance),
             pixels=pixels,
         )
 
@@ -231,7 +230,7 @@ class StereoMatcher:
         measurement = np.concatenate(used, axis=1) @ linear[0].T
         covariance = np.tile(linear[1], (len(pixels), 1, 1))
         scale, orientation = _average([(features[camera], index) for camera, index in seen])
-        position = triangulate(self._rig, measurement)
+        position = self._rig.triangulate(measurement)
         return StereoFeatures(
             measurement=measurement,
             measurement_covariance=covariance,
@@ -239,7 +238,7 @@ class StereoMatcher:
             orientation=orientation,
             descriptors=features[0].descriptors[first],
             position=position,
-            position_covariance=triangulation_covariance(self._rig, measurement, covariance),
+            position_covariance=self._rig.triangulation_covariance(measurement, covariance),
             pixels=pixels,
         )
 

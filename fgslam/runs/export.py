@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
-from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.sensors import (
@@ -338,7 +337,7 @@ def build_graph(
     seen_ids = np.concatenate([np.empty(0, np.int64), *(o.ids for o in seen)])
     used, first, landmark = np.unique(seen_ids, return_index=True, return_inverse=True)
     seen_from = np.repeat(rows, [len(o) for o in seen])
-    points = triangulate(log.rig, measurement)
+    points = log.rig.triangulate(measurement)
     wTc = trajectory.poses[seen_from[first]]
     start = np.asarray(np.einsum("nij,nj->ni", wTc[:, :3, :3], points[first]) + wTc[:, :3, 3])
     mapped = np.isin(used, ids)
@@ -362,7 +361,7 @@ def build_graph(
         seen_from=seen_from,
         seen=landmark.reshape(-1),
         points=points,
-        point_covariances=triangulation_covariance(log.rig, measurement, covariance),
+        point_covariances=log.rig.triangulation_covariance(measurement, covariance),
     )
 
 

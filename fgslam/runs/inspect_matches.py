@@ -17,7 +17,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray, Rows
 from fgslam.core.errors import FrameError
-from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.types import Features, StereoFeatures
@@ -413,10 +412,10 @@ def match_facts(seen: Samples | None, rig: CameraRig, settings: StereoSettings) 
     if len(measurement) < _FEWEST_FOR_DEPTH * len(seen.frames):
         return (*facts, ("depth", "unknown: too few matches"))
     low, middle, high = np.percentile(measurement[:, 2], [5.0, 50.0, 95.0])
-    near, usual, far = np.percentile(triangulate(rig, measurement)[:, 2], [5.0, 50.0, 95.0])
+    near, usual, far = np.percentile(rig.triangulate(measurement)[:, 2], [5.0, 50.0, 95.0])
     noise = np.zeros((len(measurement), 3, 3))
     noise[:, 2, 2] = 2.0 * settings.pixel_sigma**2  # a disparity is a difference of two positions
-    blur = np.sqrt(np.median(triangulation_covariance(rig, measurement, noise)[:, 2, 2]))
+    blur = np.sqrt(np.median(rig.triangulation_covariance(measurement, noise)[:, 2, 2]))
     depth = f"{near:.3g} to {far:.3g} m (5 to 95 %), median {usual:.3g} +- {blur:.2g} m"
     disparity = f"{low:.1f} to {high:.1f} px (5 to 95 %), median {middle:.1f} px"
     return (*facts, ("disparity", disparity), ("depth", depth))

@@ -8,17 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import (
-    compose_covariance,
-    inverse,
-    odometry_of_camera,
-    se3_exp,
-    se3_log,
-    so3_exp,
-    so3_log,
-)
+from fgslam.core.geometry import compose_covariance, inverse, se3_exp, se3_log, so3_exp, so3_log
 from fgslam.core.log import ImageSequence
-from fgslam.core.sensors import Odometry
+from fgslam.core.sensors import Odometry, odometry_of_camera
 from fgslam.core.store import Kept
 from fgslam.core.types import Prediction
 

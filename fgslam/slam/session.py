@@ -18,9 +18,9 @@ from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import later_time, require_seed
 from fgslam.core.errors import ConfigError, FrameError, OdometryError, SessionError
-from fgslam.core.geometry import compose_odometry, is_rigid
+from fgslam.core.geometry import is_rigid
 from fgslam.core.log import Frame, MeasurementLog
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Odometry, compose_odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Remark
 from fgslam.datasets.odometry import pose_noise

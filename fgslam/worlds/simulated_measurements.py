@@ -20,7 +20,9 @@ from fgslam.core.sensors import (
     Increment,
     Observations,
     Odometry,
+    compose_odometry,
     measurement_map,
+    odometry_of_camera,
     pixel_model,
     vertical_to_horizontal,
 )
@@ -110,7 +112,7 @@ def simulate_measurements(
     increments = []
     for k, index in enumerate(chosen):
         since = steps[chosen[k - 1] : index] if k else []
-        odometry = g.odometry_of_camera(g.compose_odometry(since), rig.bTc) if k else None
+        odometry = odometry_of_camera(compose_odometry(since), rig.bTc) if k else None
         stamp = float(timestamps[index])
         increments.append(camera.increment(int(index), stamp, odometry, wTc[index]))
     first = g.inverse(wTc[chosen[0]])
@@ -217,7 +219,7 @@ class _Camera:
         ok = (distance >= LEAST_RANGE_M) & (distance <= MOST_RANGE_M)
         ok &= facing >= np.cos(np.deg2rad(OBLIQUE_DEG)) * distance
         view = view[ok & g.in_front(seen_from, LEAST_RANGE_M)]
-        pixels = g.project(rig, local[view]) @ self._model.T
+        pixels = rig.predict(local[view]) @ self._model.T
         margin = np.min(
             [pixels, np.tile([rig.width - 1.0, rig.height - 1.0], rig.cameras) - pixels], axis=0
         ).min(axis=1)

@@ -24,7 +24,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.log import LANDMARK_TRUTH_FILE, LandmarkTruth, write_landmark_truth
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Odometry, compose_odometry, odometry_of_camera
 from fgslam.datasets.measured import (
     GROUND_TRUTH_FILE,
     LOG_FILE,
@@ -154,8 +154,8 @@ def _camera_step(recorded: StarryNight, k: int) -> Odometry:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = duration**2 * np.diag(variance[:3])
     covariance[3:, 3:] = duration**2 * g.congruence(rotation.T, np.diag(variance[3:]))
-    step = g.compose_odometry([Odometry(g.pose(rotation, by[3:]), covariance)])
-    return g.odometry_of_camera(step, recorded.rig.bTc)
+    step = compose_odometry([Odometry(g.pose(rotation, by[3:]), covariance)])
+    return odometry_of_camera(step, recorded.rig.bTc)
 
 
 # --------------------------------------------------------------------------------------------

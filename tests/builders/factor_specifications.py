@@ -17,18 +17,8 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import (
-    between,
-    inverse,
-    project,
-    rotation,
-    se3_log,
-    so3_log,
-    transform_to_camera,
-)
-from fgslam.core.sensors import (
-    CameraRig,
-)
+from fgslam.core.geometry import between, inverse, rotation, se3_log, so3_log, transform_to_camera
+from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Floor
 from fgslam.factors.noise import Whitening
 
@@ -67,7 +57,7 @@ def stereo_coordinates(
 
 def _image(rig: CameraRig, wTc: FloatArray, point: FloatArray) -> FloatArray | None:
     local = transform_to_camera(wTc, point[None, :])
-    return project(rig, local)[0] if local[0, 2] > 0.0 else None
+    return rig.predict(local)[0] if local[0, 2] > 0.0 else None
 
 
 def _behind(rig: CameraRig, coordinates: int) -> FloatArray:

@@ -109,7 +109,7 @@ def seen(
     """Features of the landmarks in all images, in random order, with noise, and of other things."""
     points = geometry.transform_to_camera(wTc, place.points)
     rows = np.flatnonzero(points[:, 2] > 0.5)
-    measured = geometry.project(RIG, points[rows])
+    measured = RIG.predict(points[rows])
     inside = (measured[:, :2] > 0.0).all(axis=1)
     inside &= measured[:, 0] + measured[:, 2] < RIG.width - 1
     inside &= measured[:, 1] + measured[:, 2] < RIG.height - 1
@@ -143,8 +143,8 @@ def features(
         scale=scale,
         orientation=orientation,
         descriptors=descriptors,
-        position=geometry.triangulate(RIG, measurement),
-        position_covariance=geometry.triangulation_covariance(RIG, measurement, noise),
+        position=RIG.triangulate(measurement),
+        position_covariance=RIG.triangulation_covariance(measurement, noise),
         pixels=np.full((count, 3, 2), np.nan),
     )
 

@@ -100,7 +100,7 @@ class _Book:
         seen = in_view & (rng.uniform(size=len(in_view)) >= drive.miss_rate)
         local[~in_view] = 1.0
         noise = drive.noise * np.array(drive.sigma_px) * rng.standard_normal(local.shape)
-        measured = g.project(drive.rig, local) + noise
+        measured = drive.rig.predict(local) + noise
         odometry = None if k == 0 else noisy_odometry(drive, step, rng)
         self._forget(k)
         matched, new = np.flatnonzero(seen & (self._id >= 0)), np.flatnonzero(seen & (self._id < 0))
@@ -155,7 +155,7 @@ class _Book:
         sigma = np.array(self._drive.sigma_px)
         local = g.transform_to_camera(self._poses[frame] @ true @ off, self._points[which])
         which, local = which[local[:, 2] > 0.2], local[local[:, 2] > 0.2]
-        fresh = g.project(self._drive.rig, local)
+        fresh = self._drive.rig.predict(local)
         fresh = fresh + self._drive.noise * sigma * rng.standard_normal(fresh.shape)
         old = observations(self._old_id[which], fresh, sigma, np.zeros(len(which), np.bool_))
         merged = np.column_stack([self._id[which], self._old_id[which]])

@@ -128,7 +128,7 @@ class Identities:
         sightings = self.book.take(seen, in_view)
         local[~in_view] = 1.0
         noise = drive.noise * np.array(drive.sigma_px) * rng.standard_normal(local.shape)
-        measured = g.project(drive.rig, local) + noise
+        measured = drive.rig.predict(local) + noise
         both = np.concatenate([sightings.matched, sightings.new])
         ids = np.concatenate([sightings.matched_ids, sightings.new_ids])
         is_new = np.arange(len(both)) >= len(sightings.matched)

@@ -223,7 +223,7 @@ def moved(
         if k >= since and len(row):
             local = g.transform_to_camera(simulation.poses[k], place[None])
             measured = observed.measurement.copy()
-            measured[row] = g.project(RIG, local) + PIXELS * rng.standard_normal((1, 3))
+            measured[row] = RIG.predict(local) + PIXELS * rng.standard_normal((1, 3))
             shown = observations(observed.ids, measured, PIXELS, observed.is_new)
             increment = dataclasses.replace(increment, observations=shown)
         out.append(increment)

@@ -305,15 +305,15 @@ def by_information(
             for wTc, x in zip(poses, increments, strict=True)
         ]
         seen = [(wTc, one) for wTc, one in seen if len(one)]
-        point = g.transform_to_world(seen[0][0], g.triangulate(RIG, seen[0][1].measurement))[0]
+        point = g.transform_to_world(seen[0][0], RIG.triangulate(seen[0][1].measurement))[0]
         for _ in range(5):
             information, gradient = np.zeros((3, 3)), np.zeros(3)
             for wTc, one in seen:
                 local = g.transform_to_camera(wTc, point[None])
-                jacobian = g.projection_jacobian(RIG, local)[0] @ wTc[:3, :3].T
+                jacobian = RIG.jacobian(local)[0] @ wTc[:3, :3].T
                 weight = np.linalg.inv(one.covariance[0])
                 information += jacobian.T @ weight @ jacobian
-                residual = one.measurement[0] - g.project(RIG, local)[0]
+                residual = one.measurement[0] - RIG.predict(local)[0]
                 gradient += jacobian.T @ weight @ residual
             point = point + np.linalg.solve(information, gradient)
         positions.append(point)

@@ -182,10 +182,10 @@ def test_reorthonormalising_is_idempotent_and_close(wTc: FloatArray, dirt: Float
 
 @given(rigs(), visible_points())
 def test_triangulation_undoes_projection(rig: CameraRig, points: FloatArray) -> None:
-    measured = g.project(rig, points)
+    measured = rig.predict(points)
     assert (measured[:, 2] > 0).all()
-    np.testing.assert_allclose(g.triangulate(rig, measured), points, rtol=1e-9, atol=1e-9)
-    again = g.project(rig, g.triangulate(rig, measured))
+    np.testing.assert_allclose(rig.triangulate(measured), points, rtol=1e-9, atol=1e-9)
+    again = rig.predict(rig.triangulate(measured))
     np.testing.assert_allclose(again, measured, rtol=1e-9, atol=1e-9)
 
 
@@ -195,8 +195,8 @@ def test_the_left_camera_sees_columns_shifted_by_the_disparity(
 ) -> None:
     world = g.transform_to_world(wTr, points)
     wTl = g.right_from_left_camera(wTr, -rig.baseline)
-    seen_right = g.project(rig, points)
-    seen_left = g.project(rig, g.transform_to_camera(wTl, world))
+    seen_right = rig.predict(points)
+    seen_left = rig.predict(g.transform_to_camera(wTl, world))
     scale = 1.0 + np.abs(seen_left).max()
     shifted = seen_right[:, 0] + seen_right[:, 2]
     np.testing.assert_allclose(seen_left[:, 0], shifted, rtol=0, atol=1e-9 * scale)
@@ -207,9 +207,9 @@ def test_the_left_camera_sees_columns_shifted_by_the_disparity(
 def test_triangulated_covariances_are_lawful_and_scale(
     rig: CameraRig, points: FloatArray, covariance: FloatArray, factor: float
 ) -> None:
-    measured = g.project(rig, points)
+    measured = rig.predict(points)
     pixels = np.tile(covariance, (len(points), 1, 1))
-    spread = g.triangulation_covariance(rig, measured, pixels)
+    spread = rig.triangulation_covariance(measured, pixels)
     np.testing.assert_array_equal(spread, np.swapaxes(spread, 1, 2))
     eigenvalues = np.linalg.eigvalsh(spread)
     assert (eigenvalues[:, 0] > -1e-12 * eigenvalues[:, 2]).all()
@@ -217,8 +217,8 @@ def test_triangulated_covariances_are_lawful_and_scale(
     wide = dataclasses.replace(rig, baseline=factor * rig.baseline)
     only_disparity = np.zeros_like(pixels)
     only_disparity[:, 2, 2] = 1.0
-    narrow_error = g.triangulation_covariance(rig, measured, only_disparity)
-    wide_error = g.triangulation_covariance(wide, g.project(wide, points), only_disparity)
+    narrow_error = rig.triangulation_covariance(measured, only_disparity)
+    wide_error = wide.triangulation_covariance(wide.predict(points), only_disparity)
     np.testing.assert_allclose(wide_error * factor**2, narrow_error, rtol=1e-9)
 
 

@@ -34,8 +34,6 @@ from fgslam.core.geometry import (
     inverse,
     moved_apart,
     point_pose_jacobian,
-    project,
-    projection_jacobian,
     reorthonormalise,
     se3_exp,
     se3_log_jacobian,
@@ -540,10 +538,10 @@ class Matches:
         points = transform_to_camera(wTc, positions)
         usable = in_front(points)
         points, observed = points[usable], observed.select(usable)
-        jacobian = projection_jacobian(sensor, points)
+        jacobian = sensor.jacobian(points)
         return Matches(
             blocks[usable],
-            observed.measurement - project(sensor, points),
+            observed.measurement - sensor.predict(points),
             jacobian @ point_pose_jacobian(points),
             jacobian @ wTc[:3, :3].T,
             observed.covariance,

@@ -14,8 +14,6 @@ from fgslam.core.geometry import (
     in_front,
     point_pose_jacobian,
     transform_to_world,
-    triangulate,
-    triangulation_covariance,
 )
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
 from fgslam.core.types import EgoMotion, Prediction, Trajectory
@@ -115,8 +113,8 @@ def placed(
         covariance: (k, 3, 3) of the measurements.
         pose_covariance: (6, 6); None takes the pose as exact.
     """
-    points = triangulate(sensor, measurement)
-    local = triangulation_covariance(sensor, measurement, covariance)
+    points = sensor.triangulate(measurement)
+    local = sensor.triangulation_covariance(measurement, covariance)
     if pose_covariance is not None:
         local = local + congruence(point_pose_jacobian(points), pose_covariance)
     return transform_to_world(wTc, points), congruence(wTc[:3, :3], local)
@@ -133,8 +131,8 @@ def triangulated(
     disparity = np.where(finite, observed.measurement[:, 2], 0.0)
     # Far below any disparity that a camera can tell from zero, far above one that overflows.
     observed = observed.select(disparity > 1e-6)
-    points = triangulate(rig, observed.measurement)
+    points = rig.triangulate(observed.measurement)
     kept = in_front(points)
     observed, points = observed.select(kept), points[kept]
-    covariances = triangulation_covariance(rig, observed.measurement, observed.covariance)
+    covariances = rig.triangulation_covariance(observed.measurement, observed.covariance)
     return observed, points, covariances

@@ -23,11 +23,9 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     congruence,
     moved_apart,
-    projection_jacobian,
     reorthonormalise,
     transform_to_camera,
     transform_to_world,
-    triangulate,
 )
 from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.types import (
@@ -118,7 +116,7 @@ class FixedMapPose:
         if settings.weighting == "landmark":
             rows = landmarks.rows(observed.ids)
             points = transform_to_camera(weighted_at, landmarks.positions[rows])
-            jacobian = projection_jacobian(self._rig, points) @ weighted_at[:3, :3].T
+            jacobian = self._rig.jacobian(points) @ weighted_at[:3, :3].T
             covariance = covariance + congruence(jacobian, landmarks.covariances[rows])
         used = 3 if settings.residuals == "image_disparity" else 2
         roots = np.zeros((len(observed), 3, 3))
@@ -321,7 +319,7 @@ class EliminatedUpdate(FrameUpdate):
 
     def place(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """A stereo factor alone, eliminated where it is met exactly."""
-        points = triangulate(self.rig, observed.measurement)
+        points = self.rig.triangulate(observed.measurement)
         positions = transform_to_world(self.wTc, points)
         return positions, self._eliminated(positions, None, observed).covariances
 

@@ -14,14 +14,7 @@ import numpy as np
 
 from fgslam.backend.filters.filtered import placed
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import (
-    congruence,
-    inverse_spd3,
-    point_pose_jacobian,
-    project,
-    projection_jacobian,
-    transform_to_camera,
-)
+from fgslam.core.geometry import congruence, inverse_spd3, point_pose_jacobian, transform_to_camera
 from fgslam.core.sensors import CameraRig, Observations
 
 UpdateKind: TypeAlias = Literal["pixel", "world", "running_mean", "half"]
@@ -108,12 +101,12 @@ class FrameUpdate:
     def update_by_pixels(self, known: Landmarks, observed: Observations) -> Landmarks:
         """Measured are (column, row, disparity), linearised at the landmark; R + J P J^T."""
         points = transform_to_camera(self.wTc, known.positions)
-        jacobian = projection_jacobian(self.rig, points)
+        jacobian = self.rig.jacobian(points)
         noise = observed.covariance
         if self.pose_covariance is not None:
             by_pose = jacobian @ point_pose_jacobian(points)
             noise = noise + congruence(by_pose, self.pose_covariance)
-        innovation = observed.measurement - project(self.rig, points)
+        innovation = observed.measurement - self.rig.predict(points)
         return kalman_update(known, jacobian @ self.wTc[:3, :3].T, innovation, noise)
 
     def update_by_positions(self, known: Landmarks, observed: Observations) -> Landmarks:

@@ -34,15 +34,7 @@ from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.correction import RigCorrection
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import (
-    adjoint,
-    congruence,
-    inverse,
-    se3_exp,
-    se3_log,
-    transform_to_world,
-    triangulate,
-)
+from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log, transform_to_world
 from fgslam.core.sensors import CameraRig, Increment, LoopClosure, Observations, Odometry
 from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
@@ -306,7 +298,7 @@ class GraphBuilder:
             return {}
         seen = np.array([track.last.measurement for track in tracks])
         wTc = poses[[track.last.frame for track in tracks]]
-        local = triangulate(self._sensor, seen)
+        local = self._sensor.triangulate(seen)
         places = np.einsum("kij,kj->ki", wTc[:, :3, :3], local) + wTc[:, :3, 3]
         return {track.variable: place for track, place in zip(tracks, places, strict=True)}
 

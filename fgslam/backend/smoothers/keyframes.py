@@ -27,20 +27,16 @@ from fgslam.backend.smoothers.graph import Solution, TrackedFrame, allowed_parts
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import (
     adjoint,
-    compose_odometry,
     congruence,
     in_front,
     inverse,
     inverse_spd3,
     point_pose_jacobian,
-    project,
-    projection_jacobian,
     reorthonormalise,
     se3_exp,
     transform_to_camera,
-    triangulate,
 )
-from fgslam.core.sensors import CameraRig, Observations, Odometry
+from fgslam.core.sensors import CameraRig, Observations, Odometry, compose_odometry
 from fgslam.core.types import Floor, LandmarkMap, Prediction
 from fgslam.factors.graphs import pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
@@ -72,7 +68,7 @@ def summarise(
     at_middle = transform_to_camera(middle.wTc, landmarks.positions[landmarks.rows(ids)])
     ahead = in_front(at_middle)
     at_middle[~ahead] = [0.0, 0.0, 1.0]
-    fused = project(sensor, at_middle)
+    fused = sensor.predict(at_middle)
     for _ in range(_FUSING_ITERATIONS):
         information, gradient = _stacked(sensor, block, middle, which, fused)
         covariance = inverse_spd3(information)
@@ -100,16 +96,16 @@ def _stacked(
     frames' are nearly linear; in metric space the depth of far points would be biased.
     """
     information, gradient = np.zeros((len(fused), 3, 3)), np.zeros((len(fused), 3))
-    points = triangulate(sensor, fused)
-    by_measurement = np.linalg.inv(projection_jacobian(sensor, points))
+    points = sensor.triangulate(fused)
+    by_measurement = np.linalg.inv(sensor.jacobian(points))
     start = 0
     for frame in block:
         rows = which[start : start + len(frame.accepted)]
         start += len(frame.accepted)
         fTm = inverse(frame.wTc) @ middle.wTc
         local = points[rows] @ fTm[:3, :3].T + fTm[:3, 3]
-        jacobian = projection_jacobian(sensor, local) @ fTm[:3, :3] @ by_measurement[rows]
-        residual = frame.accepted.measurement - project(sensor, local)
+        jacobian = sensor.jacobian(local) @ fTm[:3, :3] @ by_measurement[rows]
+        residual = frame.accepted.measurement - sensor.predict(local)
         weighted = np.swapaxes(jacobian, 1, 2) @ inverse_spd3(frame.accepted.covariance)
         # Identities are unique within a frame: no row is added to twice.
         information[rows] += weighted @ jacobian
@@ -344,8 +340,8 @@ def _normal_equations(
     local = np.einsum("nji,nj->ni", rotation, points - origin)
     ahead = in_front(local)
     local[~ahead] = [0.0, 0.0, 1.0]
-    residual = measured - project(sensor, local)
-    jacobian = projection_jacobian(sensor, local) @ point_pose_jacobian(local)
+    residual = measured - sensor.predict(local)
+    jacobian = sensor.jacobian(local) @ point_pose_jacobian(local)
     weighted = np.swapaxes(jacobian, 1, 2) @ weights
     weighted[~ahead] = 0.0
     hessian, gradient = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))

@@ -45,14 +45,10 @@ from fgslam.core.geometry import (
     inverse,
     inverse_spd3,
     point_pose_jacobian,
-    project,
-    projection_jacobian,
     reorthonormalise,
     se3_exp,
     transform_to_camera,
     transform_to_world,
-    triangulate,
-    triangulation_covariance,
 )
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
@@ -249,8 +245,8 @@ class SeenAgain(Rows):
         """From measurements (n, 3) at poses (n, 4, 4), of landmarks that were known before."""
         poses = poses.reshape(-1, 4, 4)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            local = triangulate(sensor, measured)
-            covariances = triangulation_covariance(sensor, measured, noise)
+            local = sensor.triangulate(measured)
+            covariances = sensor.triangulation_covariance(measured, noise)
         near = in_front(local) & np.isfinite(covariances).all(axis=(1, 2))
         near[near] = parallax(local[near], covariances[near]) >= LEAST_PARALLAX
         before = ((known.points - poses[:, :3, 3])[:, None] @ poses[:, :3, :3])[:, 0]
@@ -291,11 +287,11 @@ def _at_known_depth(
     A far point itself is not normally distributed; what it is measured by is.
     """
     expected = measured.copy()
-    expected[:, 2] = project(sensor, before)[:, 2]
-    points = triangulate(sensor, expected)
-    jacobian = projection_jacobian(sensor, points)
+    expected[:, 2] = sensor.predict(before)[:, 2]
+    points = sensor.triangulate(expected)
+    jacobian = sensor.jacobian(points)
     step = np.linalg.solve(jacobian, (measured - expected)[:, :, None])[:, :, 0]
-    return points + step, triangulation_covariance(sensor, expected, noise)
+    return points + step, sensor.triangulation_covariance(expected, noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.geometry import project, transform_to_camera, wrap
+from fgslam.core.geometry import transform_to_camera, wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Floor, LandmarkAppearances, LandmarkMap, StereoFeatures
 from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
@@ -97,7 +97,7 @@ class KnownMap:
         limit = farthest if isinstance(farthest, float) else farthest[rows]
         near = (points[:, 2] > _NEAREST_M) & (points[:, 2] <= limit)
         rows, points = rows[near], points[near]
-        column, row, disparity = project(rig, points).T
+        column, row, disparity = rig.predict(points).T
         vertical = 0.0
         if rig.vertical_baseline is not None:
             vertical = disparity * (rig.fy * rig.vertical_baseline) / (rig.fx * rig.baseline)

@@ -7,13 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.geometry import (
-    inverse_spd3,
-    point_pose_jacobian,
-    project,
-    projection_jacobian,
-    so3_exp,
-)
+from fgslam.core.geometry import inverse_spd3, point_pose_jacobian, so3_exp
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import (
     Floor,
@@ -137,8 +131,8 @@ def residuals(
     valid = ahead | ~seen.in_image
     safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
     pick = seen.in_image[:, None]
-    predicted = np.where(pick, project(rig, safe), points)
-    jacobian = np.where(pick[:, :, None], projection_jacobian(rig, safe), np.eye(3))
+    predicted = np.where(pick, rig.predict(safe), points)
+    jacobian = np.where(pick[:, :, None], rig.jacobian(safe), np.eye(3))
     to_value = jacobian @ np.swapaxes(wRc, 1, 2)
     covariance = to_value @ pairs.point_covariances @ np.swapaxes(to_value, 1, 2)
     return Residuals(

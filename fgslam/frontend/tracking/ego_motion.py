@@ -24,23 +24,14 @@ from fgslam.core.geometry import (
     moved_apart,
     point_pose_jacobian,
     pose,
-    project,
-    projection_jacobian,
     reorthonormalise,
     se3_exp,
     se3_log,
     se3_log_jacobian,
     so3_exp,
     transform_to_camera,
-    triangulate,
-    triangulation_covariance,
 )
-from fgslam.core.sensors import (
-    UNKNOWN_DISPARITY_PX,
-    CameraRig,
-    Observations,
-    measures_one_image,
-)
+from fgslam.core.sensors import UNKNOWN_DISPARITY_PX, CameraRig, Observations, measures_one_image
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
@@ -120,7 +111,7 @@ class EgoMotionSolver:
         if settings.weighting == "landmark":
             points = transform_to_camera(wTc, problem.points)
             points[~in_front(points)] = (0.0, 0.0, 1.0)  # of no use
-            jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
+            jacobian = self.sensor.jacobian(points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
         covariance = covariance * (self.noise.variance if noise is None else noise)
         if settings.residuals == "image_disparity":
@@ -169,8 +160,8 @@ class EgoMotionSolver:
         points = transform_to_camera(wTc, problem.points)
         if not in_front(points).all():
             return np.inf, np.eye(6), np.zeros(6)
-        residual = project(self.sensor, points) - problem.measurement
-        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
+        residual = self.sensor.predict(points) - problem.measurement
+        jacobian = self.sensor.jacobian(points) @ point_pose_jacobian(points)
         squared = _squared(residual, information)
         rho, weight = self._kernel(squared, robust)
         weighted = weight[:, None, None] * (information @ jacobian)
@@ -219,7 +210,7 @@ class EgoMotionSolver:
         behind = ~in_front(points)
         points[behind] = (0.0, 0.0, 1.0)
         measurement = np.broadcast_to(problem.measurement, every.shape).reshape(-1, 3)
-        residual = project(self.sensor, points) - measurement
+        residual = self.sensor.predict(points) - measurement
         across, down = residual[:, 0], residual[:, 1]
         distance = np.where(behind, np.inf, np.sqrt(across * across + down * down))
         return residual.reshape(every.shape), distance.reshape(every.shape[:-1])
@@ -336,7 +327,7 @@ class EgoMotionSolver:
             measurements (k, 6, 3): ``(sum J^T W J + P^-1)^-1`` times ``P^-1`` and ``J^T W``.
         """
         points = transform_to_camera(wTc, problem.points)
-        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
+        jacobian = self.sensor.jacobian(points) @ point_pose_jacobian(points)
         pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem, noise)
         known = np.zeros((6, 6))
         if self._settings.prior:
@@ -522,7 +513,7 @@ class Resection:
             return np.empty((0, 4, 4))
         if measures_one_image(problem.measurement_covariance).all():
             return self._start_of_one_image(problem)
-        local = triangulate(self._solver.sensor, problem.measurement)
+        local = self._solver.sensor.triangulate(problem.measurement)
         chosen = self._samples(problem, local)
         poses = align(local[chosen], problem.points[chosen], floor)
         agreeing = self._near(poses, problem).sum(axis=1)
@@ -551,8 +542,8 @@ class Resection:
         rng = np.random.default_rng(len(problem))
         drawn = rng.integers(0, len(problem), (_DRAWN, size))
         drawn = drawn[(np.diff(np.sort(drawn, axis=1), axis=1) > 0).all(axis=1)]
-        noise = triangulation_covariance(
-            sensor, problem.measurement, problem.measurement_covariance
+        noise = sensor.triangulation_covariance(
+            problem.measurement, problem.measurement_covariance
         ) + rounded(problem.point_covariances)
         keep = rigid(local[drawn], problem.points[drawn], noise[drawn], self._solver.floor)
         return np.asarray(drawn[keep if keep.any() else slice(None)][:_SAMPLES])

@@ -12,8 +12,6 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import (
     congruence,
     point_pose_jacobian,
-    project,
-    projection_jacobian,
     rotate_covariances,
     transform_to_camera,
 )
@@ -213,7 +211,7 @@ class FieldOfView:
         if wanted is not None:
             rows = rows[wanted(rows, points[rows, 2])]
         points = points[rows]
-        measurement = project(self._rig, points)
+        measurement = self._rig.predict(points)
         if self._cone:
             possible = certain = self._in_cone(points)
         else:
@@ -290,7 +288,7 @@ def predicted_covariance(
     weighted = (by_pose.reshape(-1, 6) @ prediction.covariance).reshape(by_pose.shape)
     in_camera = rotate_covariances(prediction.wTc[:3, :3].T, covariances)
     in_camera += weighted @ np.swapaxes(by_pose, 1, 2)
-    return congruence(projection_jacobian(rig, points), in_camera)
+    return congruence(rig.jacobian(points), in_camera)
 
 
 def directions_to(wTc: FloatArray, points: FloatArray) -> FloatArray:

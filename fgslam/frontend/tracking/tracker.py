@@ -14,7 +14,6 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     pose,
-    project,
     rotate_covariances,
     transform_to_camera,
     transform_to_world,
@@ -204,7 +203,7 @@ class LandmarkTracker:
         expected = tracked.expected
         points = transform_to_camera(tracked.ego_motion.wTc, landmarks.positions[expected.rows])
         ahead = in_front(points)
-        shift = project(self.rig, points[ahead]) - expected.measurement[ahead]
+        shift = self.rig.predict(points[ahead]) - expected.measurement[ahead]
         return bool(np.median(np.abs(shift[:, :2]).max(axis=1)) > REFINE_SHIFT_PX)
 
     def associate(
@@ -297,7 +296,7 @@ class LandmarkTracker:
         points = transform_to_camera(wTc, landmarks.positions[rows])
         ahead = in_front(points)
         disparity = np.ones(len(found))
-        disparity[tracked.matches.features[ahead]] = project(rig, points[ahead])[:, 2]
+        disparity[tracked.matches.features[ahead]] = rig.predict(points[ahead])[:, 2]
         by_disparity = pixel_model(rig.cameras, vertical_to_horizontal(rig))[2 * camera :, 2][:2]
         along = np.append(-by_disparity, 1.0)
         measurement, covariance = found.measurement.copy(), found.measurement_covariance.copy()

@@ -21,14 +21,7 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, FgslamError, MapError, OutputError
 from fgslam.core.files import make_subfolder
-from fgslam.core.geometry import (
-    congruence,
-    project,
-    projection_jacobian,
-    rotate_covariances,
-    transform_to_camera,
-    yaw_pitch_roll,
-)
+from fgslam.core.geometry import congruence, rotate_covariances, transform_to_camera, yaw_pitch_roll
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.sensors import CameraRig
@@ -310,8 +303,8 @@ def _measured(
     before = points[:, 2] > 0.0
     measurement = np.full((len(points), 3), np.nan)
     noise = np.full((len(points), 3, 3), np.nan)
-    measurement[before] = project(rig, points[before])
-    noise[before] = congruence(projection_jacobian(rig, points[before]), covariances[before])
+    measurement[before] = rig.predict(points[before])
+    noise[before] = congruence(rig.jacobian(points[before]), covariances[before])
     return measurement, noise
 
 

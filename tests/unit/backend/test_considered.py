@@ -164,7 +164,7 @@ def with_persistent_errors(drive: Simulation, kept: float, seed: int) -> Simulat
             if i in last:
                 error[:] = kept * last[i] + np.sqrt(1.0 - kept**2) * error
             last[i] = error
-        exact = g.project(RIG, g.transform_to_camera(wTc, drive.points_by_id[seen.ids]))
+        exact = RIG.predict(g.transform_to_camera(wTc, drive.points_by_id[seen.ids]))
         measured = exact + errors * np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
         moved = dataclasses.replace(seen, measurement=measured)
         increments.append(dataclasses.replace(increment, observations=moved))
@@ -510,7 +510,7 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     by = 1e-3 / RIG.fx * (np.array(ALL) == term)
     first = drawn(3, frames=12).increments[0].observations
     moved = first.measurement + shifts(RIG, first.measurement, field=True) @ by
-    before, after = g.triangulate(RIG, first.measurement), g.triangulate(RIG, moved)
+    before, after = RIG.triangulate(first.measurement), RIG.triangulate(moved)
     turned = (after - before) @ drawn(3, frames=12).poses[0][:3, :3].T
     gain = state_of(driven(1))["map/columns"][..., : len(SHARED)] @ by[OF_SHARED]
     np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())

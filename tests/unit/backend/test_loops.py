@@ -530,7 +530,7 @@ def found_again_where_expected(estimator: Any, count: int) -> None:
         {
             "frame": np.full(count, frame),
             "variable": np.array(list(points))[rows],
-            "measurement": g.project(RIG, local[rows]),
+            "measurement": RIG.predict(local[rows]),
             "covariance": np.tile(0.04 * np.eye(3), (count, 1, 1)),
             "gone": np.zeros(count, np.bool_),
         }

@@ -19,7 +19,7 @@ from fgslam.backend.settings import (
 from fgslam.backend.smoothers.graph import GraphBuilder, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.sensors import Observations, Odometry
+from fgslam.core.sensors import Observations, Odometry, compose_odometry
 from fgslam.core.store import restore, state_of
 from fgslam.core.types import Floor, LandmarkMap, Prediction
 from fgslam.factors.noise import plain
@@ -69,7 +69,7 @@ def driven(
         drawn = kept * np.array([errors[i] for i in ids]) + np.sqrt(1.0 - kept**2) * fresh
         errors.update(zip(ids.tolist(), drawn, strict=True))
         local = g.transform_to_camera(wTc, np.array([points[i] for i in ids]))
-        measurement = g.project(RIG, local) + scale * SIGMA * drawn
+        measurement = RIG.predict(local) + scale * SIGMA * drawn
         elsewhere = rng.uniform(size=len(ids)) < wrong
         measurement[elsewhere, 0] += 15.0
         noise.learn(k, STEP if k % 10 else lost, observed(ids, measurement))
@@ -175,7 +175,7 @@ def test_a_graph_is_weighed_again_by_what_is_known_at_its_end(measured: bool) ->
     for k in range(3):
         noise.spread, noise.power = (1.0, 1.0) if k < 2 else (2.0, 18.0)
         wTc = np.linalg.matrix_power(step, k)
-        seen = observed(np.arange(1), g.project(RIG, g.transform_to_camera(wTc, point)))
+        seen = observed(np.arange(1), RIG.predict(g.transform_to_camera(wTc, point)))
         motion = Odometry(step, 1e-4 * np.eye(6), measured) if k else None
         builder.add(TrackedFrame(k, wTc, motion, seen), known)
     graph = builder.kept_factors()
@@ -193,9 +193,9 @@ def test_a_graph_is_weighed_again_by_what_is_known_at_its_end(measured: bool) ->
 def test_steps_together_are_measured_if_each_is() -> None:
     wheels, guess = Odometry(STEP, np.eye(6)), Odometry(STEP, np.eye(6), measured=False)
     turn = Odometry.turn(STEP[:3, :3], np.eye(3))
-    assert g.compose_odometry([wheels, wheels]).measured
-    assert not g.compose_odometry([wheels, guess, wheels]).measured
-    turned = [g.compose_odometry([wheels, other]).turned for other in (wheels, guess, turn)]
+    assert compose_odometry([wheels, wheels]).measured
+    assert not compose_odometry([wheels, guess, wheels]).measured
+    turned = [compose_odometry([wheels, other]).turned for other in (wheels, guess, turn)]
     assert turned == [False, False, True]
 
 

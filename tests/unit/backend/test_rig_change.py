@@ -88,9 +88,9 @@ def test_measurements_follow_as_if_their_pixels_had_been_corrected_again(places:
 
 def test_a_landmark_moves_along_its_ray_to_where_it_is() -> None:
     pose = g.se3_exp(np.array([0.1, -0.2, 0.05, 1.0, 0.3, -0.5]))
-    exact = g.project(RIG, np.array([[0.2, -0.1, 3.0], [0.0, 0.0, -1.0]]))[:1]
+    exact = RIG.predict(np.array([[0.2, -0.1, 3.0], [0.0, 0.0, -1.0]]))[:1]
     measured = RigChange(RIG, -yaw(1.0)).measured(exact)
-    local = np.vstack([g.triangulate(RIG, measured), [0.0, 0.0, -1.0]])
+    local = np.vstack([RIG.triangulate(measured), [0.0, 0.0, -1.0]])
     at = g.transform_to_world(pose, local)
     moved = RigChange(RIG, yaw(1.0)).moved(np.stack([pose, pose]), at)
     np.testing.assert_allclose(

@@ -139,7 +139,7 @@ def drive(road: Road, wrong: FloatArray, rng: np.random.Generator) -> list[Incre
         local = g.transform_to_camera(wTc, points)
         ahead = local[:, 2] / road.scale
         seen = np.flatnonzero((ahead > NEAR_M) & (ahead < FAR_M))
-        exact = g.project(rig, local[seen]) @ model.T
+        exact = rig.predict(local[seen]) @ model.T
         inside = np.abs(exact - centre) < centre
         seen, exact = seen[inside.all(axis=1)], exact[inside.all(axis=1)]
         flat = exact.reshape(-1, rig.cameras, 2)

@@ -17,7 +17,7 @@ from fgslam.cameras.rectify import chosen_view
 from fgslam.cameras.rig import StereoRig, at_size, load_rig, read_calibration_file, rig_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera, triangulate
+from fgslam.core.geometry import pose, so3_exp, transform_to_camera
 
 SIZE = (160, 120)
 LENSES = {
@@ -50,7 +50,7 @@ def sampled(rig: StereoRig, camera: int, pixels: FloatArray) -> FloatArray:
 
 def disagreement(rig: StereoRig, cameras: tuple[RawCamera, ...], points: FloatArray) -> FloatArray:
     """Pixels (n, cameras) between where raw cameras see points and where the maps look for them."""
-    seen = project(rig.plain(), transform_to_camera(rig.bTc, points))
+    seen = rig.plain().predict(transform_to_camera(rig.bTc, points))
     views = [seen[:, :2], seen[:, :2] + np.outer(seen[:, 2], [1.0, 0.0])]
     if rig.vertical_baseline is not None:
         ratio = rig.fy * rig.vertical_baseline / (rig.fx * rig.baseline)
@@ -316,7 +316,7 @@ def rows_and_sides(
         disparity = left[:, 0] - right[:, 0]
         assert (disparity > 0.0).all()
         rows.append(left[:, 1] - right[:, 1])
-        points = triangulate(rig, np.column_stack([right, disparity]))
+        points = rig.triangulate(np.column_stack([right, disparity]))
         grid = points.reshape(board[1], board[0], 3)
         sides += [np.linalg.norm(np.diff(grid, axis=a), axis=2).ravel() for a in (0, 1)]
     return np.concatenate(rows), np.concatenate(sides), len(rows)
@@ -325,7 +325,7 @@ def rows_and_sides(
 def rectified_pixels(rig: StereoRig, one: RawCamera, pixels: FloatArray) -> FloatArray:
     """Raw pixels (n, 2) of a camera in the rectified view."""
     rays = one.unproject(pixels) @ one.bTc[:3, :3].T @ rig.bTc[:3, :3]
-    return project(rig.plain(), rays)[:, :2]
+    return rig.plain().predict(rays)[:, :2]
 
 
 # --------------------------------------------------------------------------------------------

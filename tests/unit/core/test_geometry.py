@@ -246,7 +246,7 @@ def test_projection_is_gtsams_seen_from_the_right_camera(rng: np.random.Generato
     wTl = g.right_from_left_camera(wTr, -RIG.baseline)
     camera = gtsam_stereo(wTl)
     points = g.transform_to_world(wTr, points_in_view(rng))
-    measured = g.project(RIG, g.transform_to_camera(wTr, points))
+    measured = RIG.predict(g.transform_to_camera(wTr, points))
     for point, (column, row, disparity) in zip(points, measured, strict=True):
         expected = camera.project(point)
         ours = [column + disparity, column, row]
@@ -257,17 +257,17 @@ def test_top_camera_disparity_is_positive(rng: np.random.Generator) -> None:
     points = points_in_view(rng)
     assert RIG.vertical_baseline is not None
     rTt = g.pose(np.eye(3), np.array([0.0, -RIG.vertical_baseline, 0.0]))
-    row_top = g.project(RIG, g.transform_to_camera(rTt, points))[:, 1]
-    measured = g.project(RIG, points)
+    row_top = RIG.predict(g.transform_to_camera(rTt, points))[:, 1]
+    measured = RIG.predict(points)
     ratio = RIG.fy * RIG.vertical_baseline / (RIG.fx * RIG.baseline)
     np.testing.assert_allclose(row_top - measured[:, 1], ratio * measured[:, 2], rtol=0, atol=1e-9)
 
 
 def test_projection_jacobian_against_differences(rng: np.random.Generator) -> None:
     points = points_in_view(rng)
-    analytic = g.projection_jacobian(RIG, points)
+    analytic = RIG.jacobian(points)
     for point, jacobian in zip(points, analytic, strict=True):
-        numeric = numerical_jacobian(lambda p: g.project(RIG, p[None])[0], point)
+        numeric = numerical_jacobian(lambda p: RIG.predict(p[None])[0], point)
         np.testing.assert_allclose(jacobian, numeric, rtol=1e-6, atol=1e-6)
 
 
@@ -292,20 +292,20 @@ def test_point_pose_jacobian_against_differences_and_gtsam(rng: np.random.Genera
 
 
 def test_triangulate_agrees_with_gtsam_backproject(rng: np.random.Generator) -> None:
-    measured = g.project(RIG, points_in_view(rng))
+    measured = RIG.predict(points_in_view(rng))
     camera = gtsam_stereo(g.right_from_left_camera(np.eye(4), -RIG.baseline))
-    for point, (column, row, disparity) in zip(g.triangulate(RIG, measured), measured, strict=True):
+    for point, (column, row, disparity) in zip(RIG.triangulate(measured), measured, strict=True):
         expected = camera.backproject(gtsam.StereoPoint2(column + disparity, column, row))
         np.testing.assert_allclose(point, expected, rtol=0, atol=1e-9)
 
 
 def test_triangulation_covariance_is_the_inverse_projections(rng: np.random.Generator) -> None:
-    measured = g.project(RIG, points_in_view(rng))
+    measured = RIG.predict(points_in_view(rng))
     covariance = np.stack([0.1 * random_covariance(rng, 3) for _ in measured])
-    jacobian = np.linalg.inv(g.projection_jacobian(RIG, g.triangulate(RIG, measured)))
+    jacobian = np.linalg.inv(RIG.jacobian(RIG.triangulate(measured)))
     expected = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
     np.testing.assert_allclose(
-        g.triangulation_covariance(RIG, measured, covariance), expected, rtol=1e-8, atol=1e-12
+        RIG.triangulation_covariance(measured, covariance), expected, rtol=1e-8, atol=1e-12
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, project, so3_exp, so3_log
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, so3_exp, so3_log
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.clock import (
     FrameFeatures,
@@ -111,7 +111,7 @@ def test_turns_are_seen() -> None:
     turn = np.array([0.01, -0.05, 0.02])
     frames = []
     for at in (points, points @ so3_exp(turn)):
-        measured = project(rig, at)
+        measured = rig.predict(at)
         left = np.column_stack([measured[:, 0] + measured[:, 2], measured[:, 1]])
         frames.append(stereo_features(rig, (measured[:, :2], looks), (left, looks)))
     camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])

@@ -30,7 +30,7 @@ from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError
-from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
+from fgslam.core.geometry import inverse, pose, se3_exp, so3_exp, transform_to_camera
 from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -92,7 +92,7 @@ def test_rectified_pixels_look_where_the_raw_cameras_saw_the_points(tmp_path: Pa
     points = np.column_stack(
         [rng.uniform(2, 9, 400), rng.uniform(-2, 2, 400), rng.uniform(-2, 2, 400)]
     )
-    image = project(raw.rig, transform_to_camera(raw.rig.bTc, points))
+    image = raw.rig.predict(transform_to_camera(raw.rig.bTc, points))
     inside = np.all((image[:, :2] > 2) & (image[:, :2] < np.array(EUROC_SIZE) - 3), axis=1)
     inside &= image[:, 0] + image[:, 2] < EUROC_SIZE[0] - 3
     points, image = points[inside], image[inside]

@@ -42,7 +42,7 @@ def point_before(rng: np.random.Generator, wTc: FloatArray, depth: float) -> Flo
 
 
 def image(rig: CameraRig, wTc: FloatArray, point: FloatArray) -> FloatArray:
-    return g.project(rig, g.transform_to_camera(wTc, point[None, :]))[0]
+    return rig.predict(g.transform_to_camera(wTc, point[None, :]))[0]
 
 
 def stereo(rig: CameraRig, measured: FloatArray, covariance: FloatArray) -> Any:

@@ -9,7 +9,6 @@ import pytest
 from factor_checks import assert_near, random_covariance, root_information, values_of
 from simulated import RIG
 
-from fgslam.core import geometry as g
 from fgslam.factors.graphs import is_pose, landmark_key, number, pose_key
 from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import KernelName, Whitening
@@ -43,7 +42,7 @@ def test_a_kernel_sees_the_norm_of_the_whole_measurement(
     """In any direction of a correlated three-vector: cost and weight by its norm alone."""
     covariance = random_covariance(rng, 3)
     point = np.array([0.2, -0.1, 3.0])
-    seen = g.project(RIG, point[None, :])[0]
+    seen = RIG.predict(point[None, :])[0]
     values = values_of(np.eye(4), point)
     plain, robust = StereoFactors(RIG, Whitening()), StereoFactors(RIG, Whitening(name, WIDTH))
     for _ in range(5):

@@ -103,7 +103,7 @@ def test_landmarks_in_view_are_in_every_image_and_not_hidden() -> None:
     seen_before, seen_from_behind, hidden, below_the_top_image = range(4)
     depth = np.full(4, 4.0)  # metres; the wall's right half has something before it
     pixels = np.array([[60.0, 50.0], [90.0, 80.0], [200.0, 50.0], [60.0, RIG.height - 4.0]])
-    points = g.triangulate(RIG, np.column_stack([pixels, RIG.fx * RIG.baseline / depth]))
+    points = RIG.triangulate(np.column_stack([pixels, RIG.fx * RIG.baseline / depth]))
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     directions[seen_from_behind] *= -1.0
     ids, n = np.arange(4), len(points)

@@ -10,7 +10,7 @@ from dataset_builders import save
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.geometry import transform_to_camera
 from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -101,7 +101,7 @@ def test_frames_are_a_rigid_trinocular_walk(grid: Path) -> None:
         points.append([(c - rig.cx) * depth / rig.fx, (r - rig.cy) * depth / rig.fy, depth])
     for i in range(len(recording)):
         images = recording.frame(i).images
-        expected = project(rig, transform_to_camera(truth.poses[i], np.array(points)))
+        expected = rig.predict(transform_to_camera(truth.poses[i], np.array(points)))
         for c, r, d in expected:
             assert d > 0.5
             vertical = d * rig.vertical_baseline / rig.baseline

@@ -92,7 +92,7 @@ def begun(settings: EstimatorSettings, saved: SavedMap, extends: bool = True) ->
 def seen(saved: SavedMap, noise: FloatArray | float = 0.0, count: int = 20) -> Increment:
     """The first ``count`` landmarks measured from WTC."""
     points = g.transform_to_camera(WTC, saved.landmarks.positions[:count])
-    measurement = g.project(RIG, points) + noise
+    measurement = RIG.predict(points) + noise
     observations = Observations(
         saved.landmarks.ids[:count],
         measurement,
@@ -134,7 +134,7 @@ def test_the_first_pose_is_as_uncertain_as_prior_map_and_measurement_say(
     increment = seen(saved)
     stats = estimator.update(increment, tracked(increment))
     points = g.transform_to_camera(WTC, saved.landmarks.positions[:20])
-    jacobian = g.projection_jacobian(RIG, points)
+    jacobian = RIG.jacobian(points)
     by_pose, by_landmark = jacobian @ g.point_pose_jacobian(points), jacobian @ WTC[:3, :3].T
     noise = increment.observations.covariance
     whole = g.congruence(by_landmark, saved.landmarks.covariances[:20]) + noise

@@ -15,7 +15,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import MeasurementRecording
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, compose_odometry
 from fgslam.core.types import Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, SyntheticOdometrySettings
@@ -52,7 +52,7 @@ def exactly_seen(recording: MeasurementRecording) -> list[tuple[FloatArray, Floa
         known = np.isin(seen.ids, landmarks.ids)
         rows = np.searchsorted(landmarks.ids, seen.ids[known])
         points = g.transform_to_camera(wTc, landmarks.positions[rows])
-        out.append((seen.measurement[known], g.project(rig, points), seen.ids[known]))
+        out.append((seen.measurement[known], rig.predict(points), seen.ids[known]))
     return out
 
 
@@ -240,7 +240,7 @@ def test_range_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     near = recorded(stop=None, detection={"noise_scale": 0.0})
     distance = np.concatenate(
         [
-            np.linalg.norm(g.triangulate(near.log.rig, i.observations.measurement), axis=1)
+            np.linalg.norm(near.log.rig.triangulate(i.observations.measurement), axis=1)
             for i in near.log
         ]
     )
@@ -304,7 +304,7 @@ def test_a_stride_composes_the_odometry() -> None:
     for k, increment in enumerate(third.log.increments[1:], 1):
         steps = [every.log.increments[j].odometry for j in range(3 * k + 1, 3 * k + 4)]
         assert all(step is not None for step in steps)
-        whole = g.compose_odometry(step for step in steps if step is not None)
+        whole = compose_odometry(step for step in steps if step is not None)
         assert increment.odometry is not None
         np.testing.assert_allclose(increment.odometry.motion, whole.motion, atol=1e-12)
         np.testing.assert_allclose(

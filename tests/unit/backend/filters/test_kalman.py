@@ -120,7 +120,7 @@ def started(count: int, rng: np.random.Generator, **settings: object):
 
 
 def noisy(points: FloatArray, wTc: FloatArray, rng: np.random.Generator) -> FloatArray:
-    exact = g.project(RIG, g.transform_to_camera(wTc, points))
+    exact = RIG.predict(g.transform_to_camera(wTc, points))
     return exact + SIGMA * rng.standard_normal(exact.shape)
 
 
@@ -322,7 +322,7 @@ def test_covariances_stay_positive_over_many_updates(rng: np.random.Generator) -
     """A far landmark's ellipsoid is a needle; Joseph's form keeps it lawful."""
     far = np.array([[1.0, 0.5, 25.0], [-2.0, 1.0, 30.0]])
     estimator = make(update="pixel", pose_covariance=False)
-    z = g.project(RIG, far)
+    z = RIG.predict(far)
     estimator.update(frame(0, np.arange(2), z, True), at(np.eye(4), 0))
     for k in range(1, 500):
         estimator.update(frame(k, np.arange(2), z, False), at(np.eye(4), 2))
@@ -384,7 +384,7 @@ def test_landmarks_take_no_guess_over(measured: bool, rng: np.random.Generator) 
     new = dataclasses.replace(frame(1, np.arange(5), z, True), odometry=step)
     estimator.update(new, lost)
     found = estimator.landmarks().covariances
-    alone = g.triangulation_covariance(RIG, z, np.tile(np.diag(SIGMA**2), (5, 1, 1)))
+    alone = RIG.triangulation_covariance(z, np.tile(np.diag(SIGMA**2), (5, 1, 1)))
     if measured:
         assert (np.trace(found - alone, axis1=1, axis2=2) > 3 * 20.0**2).all()
     else:

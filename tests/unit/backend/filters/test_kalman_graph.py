@@ -86,9 +86,9 @@ def updated(pair: Pair, depths: FloatArray, covariance: FloatArray, seed: int) -
     points *= (depths / points[:, 2])[:, None]
     wTc = g.se3_exp(np.array([0.02, 0.03, 0.02, 0.03, 0.03, 0.05]) * rng.standard_normal(6))
     noise = SIGMA * np.clip(rng.standard_normal((2, len(depths), 3)), -2.0, 2.0)
-    first = g.project(RIG, points) + noise[0]
+    first = RIG.predict(points) + noise[0]
     first[:, 2] = np.maximum(first[:, 2], 0.05)  # the front-end knows no disparity of zero
-    second = g.project(RIG, g.transform_to_camera(wTc, points)) + noise[1]
+    second = RIG.predict(g.transform_to_camera(wTc, points)) + noise[1]
     second[:, 2] = np.maximum(second[:, 2], 0.05)
     for estimator in pair:
         start = tracked_at(Prediction(np.eye(4), covariance), 0)
@@ -198,7 +198,7 @@ def standing_still(frames: int) -> tuple[float, float]:
     it is one and the same pose.
     """
     point = np.array([0.2, 0.1, 3.0])
-    measured = g.project(RIG, point[None])
+    measured = RIG.predict(point[None])
     _, estimator = both()
     for k in range(frames):
         there = tracked_at(Prediction(np.eye(4), UNCERTAIN), min(k, 1))

@@ -187,7 +187,7 @@ class Problem:
             for n, point in enumerate(points):
                 if n == 0 and frame > 0:
                     continue
-                seen = g.project(RIG, g.transform_to_camera(wTc, point[None, :]))[0]
+                seen = RIG.predict(g.transform_to_camera(wTc, point[None, :]))[0]
                 measured = seen + 0.3 * rng.standard_normal(3)
                 covariance = random_covariance(rng, 3, 0.3)
                 key = landmark_key(2 * n)

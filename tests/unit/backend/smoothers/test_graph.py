@@ -64,7 +64,7 @@ def frame(k: int, points: dict[int, list[float]], is_new: bool = False) -> Track
     """Frame k of a drive straight ahead, its exact observations of world points."""
     wTc = np.linalg.matrix_power(STEP, k)
     places = np.array(list(points.values())).reshape(-1, 3)
-    measured = g.project(RIG, g.transform_to_camera(wTc, places))
+    measured = RIG.predict(g.transform_to_camera(wTc, places))
     seen = observations(
         np.array(list(points), np.int64), measured, PIXELS, np.full(len(points), is_new)
     )

@@ -204,18 +204,18 @@ def by_points(
     ]
     seen = [(fTm, one) for fTm, one in seen if len(one)]
     fTm, one = seen[0]
-    point = g.transform_to_camera(fTm, g.triangulate(RIG, one.measurement))[0]
+    point = g.transform_to_camera(fTm, RIG.triangulate(one.measurement))[0]
     for _ in range(10):
         information, gradient = np.zeros((3, 3)), np.zeros(3)
         for fTm, one in seen:
             local = (fTm[:3, :3] @ point + fTm[:3, 3])[None]
-            jacobian = g.projection_jacobian(RIG, local)[0] @ fTm[:3, :3]
+            jacobian = RIG.jacobian(local)[0] @ fTm[:3, :3]
             weight = np.linalg.inv(one.covariance[0])
             information += jacobian.T @ weight @ jacobian
-            gradient += jacobian.T @ weight @ (one.measurement[0] - g.project(RIG, local)[0])
+            gradient += jacobian.T @ weight @ (one.measurement[0] - RIG.predict(local)[0])
         point = point + np.linalg.solve(information, gradient)
-    by_point = g.projection_jacobian(RIG, point[None])[0]
-    return g.project(RIG, point[None])[0], by_point @ np.linalg.inv(information) @ by_point.T
+    by_point = RIG.jacobian(point[None])[0]
+    return RIG.predict(point[None])[0], by_point @ np.linalg.inv(information) @ by_point.T
 
 
 def test_it_is_the_batch_of_its_frames_where_their_poses_are_exact() -> None:

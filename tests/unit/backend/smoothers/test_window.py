@@ -153,7 +153,7 @@ def far_away(turn: float) -> tuple[SeenAgain, Landmarks]:
     local = rng.uniform([-25.0, -18.0, 60.0], [25.0, 18.0, 90.0], (8, 3))
     points = g.transform_to_world(WTF, local)
     truly = WTF @ g.se3_exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0]))
-    measured = g.project(RIG, g.transform_to_camera(truly, points))
+    measured = RIG.predict(g.transform_to_camera(truly, points))
     measured += FAR_PX * rng.standard_normal(measured.shape)
     measured[0, 2] = -0.1
     known = Landmarks(np.arange(8), points, points, np.tile(np.eye(3), (8, 1, 1)))
@@ -177,7 +177,7 @@ def test_of_what_is_near_the_observation_alone_places_it() -> None:
     points = np.array([[0.0, 0.0, 3.0], [0.5, 0.2, 400.0], [0.0, 0.0, -3.0]])
     ahead = np.where(points[:, 2:] > 0.0, points, 4.0)
     known = Landmarks(np.array([5, 7, 8]), *2 * [g.transform_to_world(WTF, points)], *[np.eye(3)])
-    measured, noise = g.project(RIG, ahead), np.tile(0.09 * np.eye(3), (3, 1, 1))
+    measured, noise = RIG.predict(ahead), np.tile(0.09 * np.eye(3), (3, 1, 1))
     measured[2, 2] = -0.5  # and behind the camera, by what was known: of no use
     seen = SeenAgain.of(RIG, known, np.tile(WTF, (3, 1, 1)), measured, noise)
     assert (seen.variables.tolist(), seen.near.tolist()) == ([5, 7], [True, False])

@@ -7,7 +7,7 @@ import pytest
 from known_places import RIG, planar, random_descriptors
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.geometry import transform_to_camera
 from fgslam.core.types import LandmarkAppearances, LandmarkMap
 from fgslam.frontend.places.known_map import KnownMap
 
@@ -77,7 +77,7 @@ def test_what_is_in_view_is_what_projects_into_all_images(known: KnownMap, farth
         wTc = planar(1.0, -2.0, yaw)
         points = transform_to_camera(wTc, known.landmarks.positions)
         front = (points[:, 2] > 0.3) & (points[:, 2] <= farthest)
-        column, row, disparity = project(RIG, np.where(front[:, None], points, 1.0)).T
+        column, row, disparity = RIG.predict(np.where(front[:, None], points, 1.0)).T
         baselines = (RIG.vertical_baseline or 0.0) / RIG.baseline
         up = disparity * RIG.fy * baselines / RIG.fx
         inside = front & (column >= 0) & (column + disparity <= RIG.width - 1)

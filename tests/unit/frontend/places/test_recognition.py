@@ -388,7 +388,7 @@ def seen_from(
     wTc: FloatArray, points: FloatArray, ids: IntArray, rng: np.random.Generator | None = None
 ) -> Observations:
     """What a camera measures of points; with a fifth of a pixel of noise where ``rng`` is given."""
-    measured = g.project(RIG, g.transform_to_camera(wTc, points))
+    measured = RIG.predict(g.transform_to_camera(wTc, points))
     if rng is not None:
         measured = measured + 0.2 * rng.standard_normal(measured.shape)
     count = len(ids)
@@ -665,7 +665,7 @@ def test_resection_of_too_few_matches_is_refused(count: int) -> None:
 
 def features_of(seen: Observations) -> StereoFeatures:
     count = len(seen)
-    points = g.triangulate(RIG, seen.measurement)
+    points = RIG.triangulate(seen.measurement)
     return dataclasses.replace(
         StereoFeatures.empty(),
         measurement=seen.measurement,

@@ -97,7 +97,7 @@ def test_rigidity_keeps_true_samples_and_drops_stretched_and_thin_ones(
 def _pairs(rng: np.random.Generator, truth: np.ndarray, in_space: bool) -> Pairs:
     points = geometry.transform_to_world(truth, rng.uniform([-1, -1, 2], [1, 1, 5], (12, 3)))
     here = geometry.transform_to_camera(truth, points)
-    value = here if in_space else geometry.project(RIG, here)
+    value = here if in_space else RIG.predict(here)
     noise = np.tile((1e-4 if in_space else 0.04) * np.eye(3), (12, 1, 1))
     point = SeenPoints(np.full(12, not in_space), value, noise, here, noise)
     return Pairs(point, points, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
@@ -153,7 +153,7 @@ def test_covariance_is_the_scatter_of_poses() -> None:
     nees = []
     for _ in range(60):
         view = seen(place, truth, rng)
-        here = geometry.project(RIG, geometry.transform_to_camera(truth, place.points))
+        here = RIG.predict(geometry.transform_to_camera(truth, place.points))
         nearest = np.argmin(np.linalg.norm(view.measurement[:, None] - here[None], axis=2), axis=1)
         pairs = Pairs.of(SeenPoints.of(view, RIG), np.arange(len(view)), exact, nearest)
         rows = np.zeros(len(view), np.int64)

@@ -68,7 +68,7 @@ def scene(
 ) -> PoseProblem:
     """Exact landmarks in view of ``wTc``, measured with noise."""
     local = points_in_view(RIG, count, (1.5, 6.0), rng)
-    measured = g.project(RIG, local) + noise * sigma * rng.standard_normal(local.shape)
+    measured = RIG.predict(local) + noise * sigma * rng.standard_normal(local.shape)
     return PoseProblem(
         points=g.transform_to_world(wTc, local),
         point_covariances=np.zeros((count, 3, 3)),
@@ -132,7 +132,7 @@ def test_analytic_jacobian_is_the_numerical_one() -> None:
     problem = scene(FORWARD, rng)
     wTc, predicted = perturbed(FORWARD, rng), perturbed(FORWARD, rng)
     points = g.transform_to_camera(wTc, problem.points)
-    by_image = g.projection_jacobian(RIG, points) @ g.point_pose_jacobian(points)
+    by_image = RIG.jacobian(points) @ g.point_pose_jacobian(points)
     by_prior = g.se3_log_jacobian(g.se3_log(g.inverse(predicted) @ wTc))
     analytic = np.vstack(
         [(by_image / SIGMA[:, None]).reshape(-1, 6), by_prior / PRIOR_SIGMA[:, None]]
@@ -233,10 +233,10 @@ def paper_like(rng: np.random.Generator, dof: int = 6) -> tuple[EgoMotion, Float
     # Uniform in disparity: this is what reproduces the spread.
     local *= (1.0 / rng.uniform(1 / 6.0, 1 / 1.5, 43) / local[:, 2])[:, None]
     world = g.transform_to_world(FORWARD, local)
-    first = g.project(RIG, world) + sigma * rng.standard_normal(world.shape)
-    second = g.project(RIG, local) + sigma * rng.standard_normal(world.shape)
+    first = RIG.predict(world) + sigma * rng.standard_normal(world.shape)
+    second = RIG.predict(local) + sigma * rng.standard_normal(world.shape)
     problem = PoseProblem(
-        g.triangulate(RIG, first),
+        RIG.triangulate(first),
         np.zeros((43, 3, 3)),
         second,
         np.tile(2.0 * np.diag(sigma**2), (43, 1, 1)),

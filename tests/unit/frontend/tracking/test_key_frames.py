@@ -11,7 +11,6 @@ import pytest
 from textured_wall import HERE, RIG, WALL_M, pictures
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.geometry import project
 from fgslam.core.store import restore, state_of
 from fgslam.core.types import (
     CUT_PIXELS,
@@ -51,7 +50,7 @@ GRID = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(-0.5, 0.5, 6)
 def measurements(place: FloatArray) -> FloatArray:
     """(n, 3) of the grid's points, exact."""
     points = np.column_stack([GRID, np.full(len(GRID), WALL_M)]) - place
-    return project(RIG, points)
+    return RIG.predict(points)
 
 
 def expected(place: FloatArray, off: float = 0.0) -> ExpectedLandmarks:

@@ -53,7 +53,7 @@ TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
 def stereo_features(points: FloatArray, scale: float = 3.0) -> StereoFeatures:
     """Exact features of points (n, 3) in the camera's frame, each with its own descriptor."""
     count = len(points)
-    measured = g.project(RIG, points)
+    measured = RIG.predict(points)
     covariance = np.tile(0.09 * np.eye(3), (count, 1, 1))
     descriptors = np.random.default_rng(1).integers(0, 256, (count, 128)).astype(np.uint8)
     return StereoFeatures(
@@ -63,7 +63,7 @@ def stereo_features(points: FloatArray, scale: float = 3.0) -> StereoFeatures:
         orientation=np.linspace(0.1, 6.0, count),
         descriptors=descriptors,
         position=points.copy(),
-        position_covariance=g.triangulation_covariance(RIG, measured, covariance),
+        position_covariance=RIG.triangulation_covariance(measured, covariance),
         pixels=np.full((count, 3, 2), np.nan),
     )
 
@@ -84,7 +84,7 @@ def landmark_map(points: FloatArray, ids: IntArray | None = None) -> LandmarkMap
 
 def at_pixels(rows: list[tuple[float, float, float]]) -> FloatArray:
     """Points whose (column, row, disparity) are those given."""
-    return g.triangulate(RIG, np.array(rows, np.float64))
+    return RIG.triangulate(np.array(rows, np.float64))
 
 
 def expected_ids(points: FloatArray, settings: DatabaseSettings, rig: CameraRig = RIG) -> list[int]:
@@ -272,8 +272,7 @@ def test_predicted_covariance_matches_monte_carlo() -> None:
     prediction = Prediction(wTc, np.diag(pose_sigma**2))
     stated = predicted_covariance(RIG, prediction, point, (root @ root.T)[None])[0]
     drawn = [
-        g.project(
-            RIG,
+        RIG.predict(
             g.transform_to_camera(
                 wTc @ g.se3_exp(pose_sigma * rng.standard_normal(6)),
                 point + (root @ rng.standard_normal(3))[None],

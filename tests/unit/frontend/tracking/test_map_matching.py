@@ -55,7 +55,7 @@ def full_scan(
     for k, point in enumerate(points):
         if point[2] <= 0.1:
             continue
-        column, row, disparity = g.project(rig, point[None])[0]
+        column, row, disparity = rig.predict(point[None])[0]
         top = disparity if rig.vertical_baseline is not None else 0.0
         if disparity > MAX_DISPARITY:
             continue
@@ -88,7 +88,7 @@ def test_the_selection_is_that_of_a_full_scan(how: str, rig: CameraRig) -> None:
                 rng.uniform(0.5, 45.0, 400),
             ]
         )
-        local = np.concatenate([rng.uniform(-6.0, 6.0, (400, 3)), g.triangulate(rig, edge)])
+        local = np.concatenate([rng.uniform(-6.0, 6.0, (400, 3)), rig.triangulate(edge)])
         positions = g.transform_to_world(wTc, local)
         found = FieldOfView(rig, settings, MAX_DISPARITY).select(wTc, positions)
         seen_from_there = g.transform_to_camera(wTc, positions)
@@ -96,7 +96,7 @@ def test_the_selection_is_that_of_a_full_scan(how: str, rig: CameraRig) -> None:
         np.testing.assert_array_equal(found.rows, np.flatnonzero(possible))
         np.testing.assert_array_equal(found.certain, certain[possible])
         np.testing.assert_array_equal(found.points, seen_from_there[possible])
-        np.testing.assert_array_equal(found.measurement, g.project(rig, found.points))
+        np.testing.assert_array_equal(found.measurement, rig.predict(found.points))
         assert 10 < len(found.rows) < 700  # a cone is a small part of a cylinder
 
 
@@ -105,14 +105,14 @@ def test_an_edge_of_the_image_is_inside() -> None:
     at = np.array([[-8.0, 100.0, 10.0], [100.0, -8.0, 10.0], [8.0, 100.0, 10.0]])
     rig = dataclasses.replace(RIG, fx=256.0, fy=256.0, cx=160.0, cy=120.0, baseline=0.125)
     found = FieldOfView(rig, SETTINGS["image"], MAX_DISPARITY).select(
-        np.eye(4), g.triangulate(rig, at)
+        np.eye(4), rig.triangulate(at)
     )
     assert found.rows.tolist() == [0, 1, 2]
     assert found.certain.tolist() == [False, False, True]
 
 
 def test_what_is_too_small_to_be_found_is_not_expected() -> None:
-    points = g.triangulate(RIG, np.array([[100.0, 80.0, 10.0], [200.0, 120.0, 20.0]]))
+    points = RIG.triangulate(np.array([[100.0, 80.0, 10.0], [200.0, 120.0, 20.0]]))
     database = database_of(points, DatabaseSettings(least_scale_px=2.0))
     first_scale = 3.0  # pixels, seen from the origin
     for back, count in ((0.0, 2), (2.0, 1), (6.0, 0)):

@@ -81,7 +81,7 @@ class Scene:
 
     def _update(self, association: Association, wTc: FloatArray) -> None:
         new = association.observations.select(association.observations.is_new)
-        points = g.transform_to_world(wTc, g.triangulate(RIG, new.measurement))
+        points = g.transform_to_world(wTc, RIG.triangulate(new.measurement))
         ids = np.concatenate([self.map.ids, new.ids])
         positions = np.concatenate([self.map.positions, points])
         keep = ~np.isin(ids, association.pruned_ids)
@@ -122,7 +122,7 @@ def test_seen_again_is_type_III() -> None:
     assert len(matched) >= 0.9 * before
     assert not association.rejected.any()
     # They are the same points: back-projected to where the map has them.
-    found = g.transform_to_world(moved, g.triangulate(RIG, matched.measurement))
+    found = g.transform_to_world(moved, RIG.triangulate(matched.measurement))
     np.testing.assert_allclose(found, scene.map.positions[scene.map.rows(matched.ids)], atol=1e-6)
     rows = scene.tracker.database.rows(matched.ids)
     assert (scene.tracker.database.hits[rows] == 2).all()
@@ -196,7 +196,7 @@ def test_a_camera_at_rest_starts_each_track_once() -> None:
     scene = Scene()
     scene.step(np.eye(4))
     count = len(scene.map)
-    measured = g.project(RIG, scene.map.positions)
+    measured = RIG.predict(scene.map.positions)
     assert (measured[:, :2].min(axis=1) < 8.0).any()
     for _ in range(5):
         _, association = scene.step(np.eye(4))
@@ -361,7 +361,7 @@ class Things:
         tracked = self._tracker.track(Prediction(wTc, CERTAIN), self.map, stereo)
         association = self._tracker.associate(tracked, stereo, IMAGE)
         new = association.observations.select(association.observations.is_new)
-        found = g.transform_to_world(wTc, g.triangulate(RIG, new.measurement))
+        found = g.transform_to_world(wTc, RIG.triangulate(new.measurement))
         ids = np.concatenate([self.map.ids, new.ids])
         positions = np.concatenate([self.map.positions, found])
         keep = ~np.isin(ids, association.pruned_ids)
