@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from benchmarks.gtsam_graphs import in_arrays
 from benchmarks.speed.drives import (
     MeasuredDrive,
     Played,
@@ -31,7 +32,6 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.batch import BatchSolver
-from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.backend.smoothers.elimination import reduced
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
@@ -174,7 +174,7 @@ def all_marginals(repeats: int, seed: int = 0) -> dict[str, float]:
     """
     graph, start = problem(open_drive("lab_trials", BIG_MAP))
     values = minimum(graph, start)
-    whole, state = WholeGraph.of(graph, values)
+    whole, state = in_arrays(graph, values)
     keys = np.array(whole.landmark_keys)
     sample = np.random.default_rng(seed).choice(keys, SAMPLE, replace=False)
 

@@ -11,9 +11,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from benchmarks.gtsam_graphs import in_arrays
 from benchmarks.speed.drives import MeasuredDrive, cpu_seconds, interleaved, open_drive, play
 from fgslam.backend.settings import BatchSettings, FixedLagSettings, Isam2Settings, KernelSettings
-from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
@@ -120,7 +120,7 @@ def _same_loss(plain: PlainGtsam, kernel: KernelSettings, repeats: int) -> dict[
     costs: dict[str, float] = {}
 
     def ours() -> None:
-        graph, state = WholeGraph.of(plain.graph, plain.values, kernel)
+        graph, state = in_arrays(plain.graph, plain.values, kernel)
         costs["ours"] = graph.cost(graph.minimum(state, 100, _TOLERANCE))
 
     def theirs() -> None:

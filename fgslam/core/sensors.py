@@ -20,6 +20,7 @@ from fgslam.core.geometry import (
     change_tangent_frame,
     compose_covariance,
     congruence,
+    in_front,
     inverse,
 )
 from fgslam.core.settings import RigPlaces
@@ -255,6 +256,7 @@ class CameraRig(Brief):
     bTc: FloatArray
     exact: bool = False
     places: RigPlaces = field(default="all", repr=False)
+    angles = ()  # none of the three is one
 
     @property
     def angles_deg(self) -> tuple[float, float]:
@@ -282,11 +284,16 @@ class CameraRig(Brief):
         fTc[0, 3] = self.baseline if frame == "left" else 0.0
         return fTc
 
-    # -- what the rig measures of points in the reference camera's frame: a landmark model -----
+    # -- what it measures of points in the reference camera's frame: a model of landmarks ------
+
+    @property
+    def unpredicted(self) -> FloatArray:
+        """(3,) residual of what is not before it, as of GTSAM's factor: two focal lengths off."""
+        return np.array([2.0 * self.fx, 2.0 * self.fx, 0.0])
 
     def predict(self, points: FloatArray) -> FloatArray:
-        """(column, row, disparity) (n, 3) of points (n, 3) before the reference camera."""
-        inverse_depth = 1.0 / points[:, 2]
+        """(column, row, disparity) (n, 3) of points (n, 3); NaN of those not before the camera."""
+        inverse_depth = 1.0 / np.where(in_front(points), points[:, 2], np.nan)
         out = np.empty_like(points)
         out[:, 0] = self.cx + self.fx * points[:, 0] * inverse_depth
         out[:, 1] = self.cy + self.fy * points[:, 1] * inverse_depth

@@ -6,15 +6,14 @@ Derivation: docs/derivations/measurements.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.geometry import in_front, skew
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.sensors import CameraRig
+from fgslam.factors.measurement import LinearRows
 from fgslam.factors.noise import Whitening
 
 FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -63,97 +62,14 @@ class StereoFactors:
 
 
 # --------------------------------------------------------------------------------------------
-# Many observations at once, for solvers that eliminate landmarks themselves.
-#
-# One of a point behind the camera pulls nothing and costs as much as GTSAM's factor then does.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearRows(Rows):
-    """Linearised observations, whitened and weighed: ``residual + by_pose dx + by_point dl``.
-
-    Attributes:
-        residual: (k, 3).
-        by_pose: (k, 3, 6) by the tangent of ``wTc``.
-        by_point: (k, 3, 3) by the world point.
-    """
-
-    residual: FloatArray
-    by_pose: FloatArray
-    by_point: FloatArray
-
-
-def whitening(covariances: FloatArray) -> FloatArray:
-    """(k, 3, 3) that turn residuals of covariances (k, 3, 3) into ones of unit covariance."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
-
-
-def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
-    """World points (k, 3) in the frames of poses ``wTc`` (k, 4, 4), one each."""
-    offset = points - poses[:, :3, 3]
-    return np.asarray(np.einsum("kji,kj->ki", poses[:, :3, :3], offset))
-
-
-def residuals(
-    rig: CameraRig,
-    poses: FloatArray,
-    points: FloatArray,
-    measurement: FloatArray,
-    roots: FloatArray,
-) -> FloatArray:
-    """Whitened residuals (k, 3), predicted minus measured; arguments of :func:`linearised`."""
-    return products(roots, _off(rig, in_cameras(poses, points), measurement)[0])
-
-
-def linearised(
-    rig: CameraRig,
-    poses: FloatArray,
-    points: FloatArray,
-    measurement: FloatArray,
-    roots: FloatArray,
-) -> LinearRows:
-    """Whitened observations, predicted minus measured.
-
-    Args:
-        rig: the cameras.
-        poses: (k, 4, 4) ``wTc`` of each observation.
-        points: (k, 3) of its landmark, world.
-        measurement: (k, 3).
-        roots: (k, 3, 3) of :func:`whitening`.
-    """
-    local = in_cameras(poses, points)
-    off, seen = _off(rig, local, measurement)
-    jacobian = roots @ rig.jacobian(np.where(seen[:, None], local, 1.0))
-    jacobian[~seen] = 0.0
-    by_pose = np.empty((len(local), 3, 6))
-    by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
-    by_point = jacobian @ np.swapaxes(poses[:, :3, :3], 1, 2)
-    return LinearRows(products(roots, off), by_pose, by_point)
-
-
-def _off(
-    rig: CameraRig, local: FloatArray, measurement: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Residuals (k, 3) of points in the camera's frame, and which are in front (k,)."""
-    seen = in_front(local)
-    predicted = rig.predict(np.where(seen[:, None], local, 1.0))
-    off = predicted - measurement
-    # As GTSAM's factor has it: both columns and the row are two focal lengths off.
-    off[~seen] = [2.0 * rig.fx, 2.0 * rig.fx, 0.0]
-    return off, seen
+# Many observations at once, for solvers that eliminate landmarks themselves
 
 
 def weighed(rows: LinearRows, weight: FloatArray) -> LinearRows:
     """The rows with weights (k,) of their squares."""
     root = np.sqrt(weight)[:, None]
-    return LinearRows(
-        root * rows.residual, root[:, :, None] * rows.by_pose, root[:, :, None] * rows.by_point
-    )
-
-
-def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(k, i) products of matrices (k, i, j) and vectors (k, j)."""
-    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+    by_pose, by_point = (root[:, :, None] * by for by in (rows.by_pose, rows.by_point))
+    return LinearRows(root * rows.residual, by_pose, by_point, rows.usable)
 
 
 def summed(index: IntArray, values: FloatArray, size: int) -> FloatArray:

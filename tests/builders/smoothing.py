@@ -124,12 +124,13 @@ class Failing:
 
 def counting(graph: Any, whole: WholeGraph) -> Any:
     """Those of GTSAM's factors that count in a graph in arrays made of them, without kernels."""
-    left = np.zeros(graph.size(), np.bool_)
-    if whole.seen is not None:
-        left[whole.seen.rows[whole.weights <= 0.0]] = True
+    every = [graph.at(row) for row in range(graph.size())]
+    left = np.zeros(len(every), np.bool_)
+    seen = [isinstance(factor, gtsam.GenericStereoFactor3D) for factor in every]
+    left[seen] = whole.weights <= 0.0
     out = gtsam.NonlinearFactorGraph()
     for row in np.flatnonzero(~left).tolist():
-        out.add(plain(graph.at(row)))
+        out.add(plain(every[row]))
     return out
 
 

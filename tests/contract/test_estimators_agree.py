@@ -26,6 +26,7 @@ from smoothing import (
     run,
 )
 
+from benchmarks.gtsam_graphs import in_arrays
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
@@ -38,7 +39,6 @@ from fgslam.backend.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.backend.smoothers.final import Refined
 from fgslam.backend.smoothers.isam2 import Isam2Solver
 from fgslam.core import geometry as g
@@ -186,7 +186,7 @@ def own_values(solver: Isam2Solver) -> Refined:
     """The tree's own values as they are, without the last word that the estimate has."""
     values = gtsam.Values(solver.values)
     values.insert(solver.new_values)
-    return Refined(*WholeGraph.of(solver.builder.kept_factors(), values, solver.builder.kernel))
+    return Refined(*in_arrays(solver.builder.kept_factors(), values, solver.builder.kernel))
 
 
 def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,12 +25,11 @@ from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
 from fgslam.backend.settings import EkfSettings
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     adjoint,
     congruence,
-    in_front,
     inverse,
     moved_apart,
     point_pose_jacobian,
@@ -38,7 +37,6 @@ from fgslam.core.geometry import (
     se3_exp,
     se3_log_jacobian,
     so3_log,
-    transform_to_camera,
     transform_to_world,
 )
 from fgslam.core.sensors import (
@@ -51,6 +49,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, Estimate, Floor, LandmarkMap, Prediction, UpdateStats
+from fgslam.factors.measurement import linearise
 
 FRONT = 6
 """The pose's rows and columns come first."""
@@ -506,7 +505,7 @@ class FullEkf:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matches:
+class Matches(Rows):
     """Observations of known landmarks, linearised at a pose.
 
     Attributes:
@@ -523,9 +522,6 @@ class Matches:
     by_landmark: FloatArray
     noise: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.blocks)
-
     @staticmethod
     def of(
         sensor: CameraRig,
@@ -535,17 +531,9 @@ class Matches:
         observed: Observations,
     ) -> Matches:
         """Linearises at the landmarks' positions (k, 3); those not before the sensor drop out."""
-        points = transform_to_camera(wTc, positions)
-        usable = in_front(points)
-        points, observed = points[usable], observed.select(usable)
-        jacobian = sensor.jacobian(points)
-        return Matches(
-            blocks[usable],
-            observed.measurement - sensor.predict(points),
-            jacobian @ point_pose_jacobian(points),
-            jacobian @ wTc[:3, :3].T,
-            observed.covariance,
-        )
+        rows = linearise(sensor, wTc, positions, observed.measurement)
+        matches = Matches(blocks, -rows.residual, rows.by_pose, rows.by_point, observed.covariance)
+        return matches.select(rows.usable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

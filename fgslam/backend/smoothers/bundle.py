@@ -33,7 +33,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import Damping, adjoint, compose_covariance, inverse
 from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
 from fgslam.factors.graphs import is_pose, number
-from fgslam.factors.landmark import FROM_MEASUREMENT, LinearRows, linearised, residuals, whitening
+from fgslam.factors.measurement import LinearRows, linearise, residuals, whitening
 from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definite
 
 # ------------------------------------------------------------------------------------------
@@ -41,62 +41,43 @@ from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StereoSightings:
-    """Observations of one rig.
+class Sightings:
+    """Observations of landmarks by one model.
 
     Attributes:
-        rows: of their factors in the graph that they come from (k,).
+        model: of the sensor, whose poses are variables.
         poses: rows (k,) of their poses.
         points: rows (k,) of their landmarks.
-        measured: (k, 3) column, row, disparity, pixels.
-        roots: (k, 3, 3) square roots of their informations.
-        rig: the cameras; their images' size is not known.
+        measured: (k, m).
+        roots: (k, m, m) square roots of their informations.
     """
 
-    rows: IntArray
+    model: CameraRig
     poses: IntArray
     points: IntArray
     measured: FloatArray
     roots: FloatArray
-    rig: CameraRig
 
-    @staticmethod
-    def of(
-        factors: list[Any], rows: IntArray, poses: IntArray, points: IntArray
-    ) -> StereoSightings:
-        """Of stereo factors, with or without kernels."""
-        left, right, row = np.array([factor.measured().vector() for factor in factors]).T
-        roots = np.empty((len(factors), 3, 3))
-        for root, factor in zip(roots, factors, strict=True):
-            model = factor.noiseModel()
-            bare: Any = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
-            root[:] = bare.R()
-        k = factors[0].calibration()
-        rig = CameraRig(0, 0, k.fx(), k.fy(), k.px(), k.py(), k.baseline(), None, np.eye(4))
-        measured = np.column_stack([right, row, left - right])
-        return StereoSightings(rows, poses, points, measured, roots @ FROM_MEASUREMENT, rig)
-
-    def of_points(self, kept: BoolArray) -> StereoSightings:
+    def of_points(self, kept: BoolArray) -> Sightings:
         """Those of some landmarks, a mask (m,), whose rows are renumbered."""
         own, number = kept[self.points], np.cumsum(kept) - 1
-        return StereoSightings(
-            self.rows[own],
+        return Sightings(
+            self.model,
             self.poses[own],
             number[self.points[own]],
             self.measured[own],
             self.roots[own],
-            self.rig,
         )
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
-        """Whitened residuals (k, 3) at all poses (n, 4, 4) and points (m, 3)."""
+        """Whitened residuals (k, m) at all poses (n, 4, 4) and points (p, 3)."""
         own, seen = poses[self.poses], points[self.points]
-        return residuals(self.rig, own, seen, self.measured, self.roots)
+        return residuals(self.model, own, seen, self.measured, self.roots)
 
     def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
         """The same, with derivatives."""
         own, seen = poses[self.poses], points[self.points]
-        return linearised(self.rig, own, seen, self.measured, self.roots)
+        return linearise(self.model, own, seen, self.measured, self.roots)
 
 
 def values_of(keys: dict[int, int], poses: FloatArray, points: FloatArray) -> Any:
@@ -469,34 +450,13 @@ class WholeGraph:
 
     pose_keys: list[int]
     landmark_keys: list[int]
-    seen: StereoSightings | None
+    seen: Sightings | None
     weights: FloatArray
     rest: OtherFactors
     kernel: KernelSettings
 
     @staticmethod
-    def of(graph: Any, values: Any, kernel: KernelSettings = PLAIN) -> tuple[WholeGraph, State]:
-        """A graph of GTSAM's without empty slots, whose observations have this kernel."""
-        poses, landmarks = keys_of(values)
-        rows = {key: row for keys in (poses, landmarks) for row, key in enumerate(keys)}
-        rest, found = gtsam.NonlinearFactorGraph(), list[tuple[Any, int, int, int]]()
-        for row in range(graph.size()):
-            factor = graph.at(row)
-            if isinstance(factor, gtsam.GenericStereoFactor3D):
-                pose, landmark = factor.keys()
-                found.append((factor, row, rows[pose], rows[landmark]))
-            else:
-                rest.add(factor)
-        seen = None
-        if found:
-            factors, *which = zip(*found, strict=True)
-            seen = StereoSightings.of(list(factors), *(np.array(w, np.int64) for w in which))
-        weights = np.ones(len(found))
-        others = OtherFactors(rest, poses, landmarks)
-        return WholeGraph(poses, landmarks, seen, weights, others, kernel), State.of(values)
-
-    @staticmethod
-    def of_rig(
+    def of(
         others: Any,
         values: Any,
         kernel: KernelSettings,
@@ -519,10 +479,9 @@ class WholeGraph:
             np.searchsorted(np.array(have, np.int64), which).astype(np.int64)
             for have, which in zip((poses, landmarks), keys, strict=True)
         )
-        rows = others.size() + np.arange(len(of_pose))
-        seen = StereoSightings(rows, of_pose, of_landmark, *measured, rig) if len(rows) else None
+        seen = Sightings(rig, of_pose, of_landmark, *measured) if len(of_pose) else None
         rest = OtherFactors(others, poses, landmarks)
-        graph = WholeGraph(poses, landmarks, seen, np.ones(len(rows)), rest, kernel)
+        graph = WholeGraph(poses, landmarks, seen, np.ones(len(of_pose)), rest, kernel)
         return graph, State.of(values)
 
     def with_turns(
@@ -628,7 +587,7 @@ class WholeGraph:
         if seen is None:
             raise ValueError("without observations there is nothing to shift")
         rows, parts = seen.look(state.poses, state.points), []
-        for few in np.array_split(np.arange(len(seen.rows)), len(seen.rows) // _AT_ONCE + 1):
+        for few in np.array_split(np.arange(len(seen.poses)), len(seen.poses) // _AT_ONCE + 1):
             by = -seen.roots[few] @ shifts(seen.measured[few])
             known = self.weights[few, None, None] * by
             poses, points = (which[:, few] for which in self._incidence)

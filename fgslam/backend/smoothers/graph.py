@@ -38,7 +38,8 @@ from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log,
 from fgslam.core.sensors import CameraRig, Increment, LoopClosure, Observations, Odometry
 from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
-from fgslam.factors.landmark import StereoFactors, whitening
+from fgslam.factors.landmark import StereoFactors
+from fgslam.factors.measurement import whitening
 from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
 from fgslam.factors.noise import Whitening, scaled
 
@@ -328,7 +329,7 @@ class GraphBuilder:
         """Without turns of a gyroscope."""
         others = self._other_factors(turned=False)
         frames, variables, measured, covariances = self.kept_observed()
-        return WholeGraph.of_rig(
+        return WholeGraph.of(
             others,
             values,
             kernel,

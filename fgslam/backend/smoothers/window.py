@@ -52,7 +52,8 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
-from fgslam.factors.landmark import LinearRows, linearised, products, summed, weighed, whitening
+from fgslam.factors.landmark import summed, weighed
+from fgslam.factors.measurement import LinearRows, linearise, products, whitening
 from fgslam.factors.noise import kernel_weights
 
 # ------------------------------------------------------------------------------------------
@@ -687,7 +688,7 @@ class Window:
         """Some of the window's observations; a kernel weighs each where it is linearised."""
         (pose, point), o, kernel = self._rows(observed), observed, self.kernel
         at, places = self._where_linearised()
-        rows = linearised(self._sensor, at[pose], places[point], o.measurement, o.root)
+        rows = linearise(self._sensor, at[pose], places[point], o.measurement, o.root)
         squared = np.einsum("ki,ki->k", rows.residual, rows.residual)
         weight = kernel_weights(kernel.name, kernel.width, squared)
         residual = rows.residual + products(rows.by_point, (self.landmarks.points - places)[point])

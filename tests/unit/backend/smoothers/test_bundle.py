@@ -14,6 +14,7 @@ from factor_checks import random_covariance
 from simulated import RIG, Drive, Simulation, assert_same_bits, simulate
 from smoothing import drawn, run, wrong_matches
 
+from benchmarks.gtsam_graphs import in_arrays
 from fgslam.backend.loops import Constraint, constraint_factor
 from fgslam.backend.settings import (
     BatchSettings,
@@ -114,7 +115,7 @@ def test_both_eliminations_step_alike() -> None:
 def test_graphs_of_arrays_and_of_factors_are_one_also_without_some_landmarks() -> None:
     graph, values, builder = problem("cauchy")
     kernel = builder.kernel
-    pairs = [builder.whole_graph(values), WholeGraph.of(graph, values, kernel)]
+    pairs = [builder.whole_graph(values), in_arrays(graph, values, kernel)]
     gone = np.array([0, 3, 7])
     for (ours, state), (theirs, other) in (pairs, [w.without(gone, s) for w, s in pairs]):
         assert ours.landmark_keys == theirs.landmark_keys

@@ -14,8 +14,9 @@ from factor_specifications import RawPixelFactors
 from scipy.sparse import bsr_matrix, csr_matrix
 from simulated import RIG, points_in_view
 
+from benchmarks.gtsam_graphs import in_arrays
 from fgslam.backend.settings import KernelSettings
-from fgslam.backend.smoothers.bundle import PLAIN, WholeGraph
+from fgslam.backend.smoothers.bundle import PLAIN
 from fgslam.backend.smoothers.elimination import (
     BlockCholesky,
     ChainMarginals,
@@ -160,7 +161,7 @@ RELATIVE = 1e-8
 def whole(
     kind: Whole, graph: Any, values: Any, kernel: KernelSettings = PLAIN
 ) -> GraphMarginals | ChainMarginals:
-    system, state = WholeGraph.of(graph, values, kernel)
+    system, state = in_arrays(graph, values, kernel)
     return kind.of(system.linear(state))
 
 
@@ -215,7 +216,7 @@ class Problem:
 
 
 def either(graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
-    system, state = WholeGraph.of(graph, values)
+    system, state = in_arrays(graph, values)
     return reduced(system.linear(state))
 
 
@@ -253,7 +254,7 @@ def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Gener
     problem = problems()[name](rng)
     reference = problem.reference()
     kernel = KernelSettings("cauchy", 0.5) if name == "robust" else PLAIN
-    graph, state = WholeGraph.of(problem.graph, problem.values, kernel)
+    graph, state = in_arrays(problem.graph, problem.values, kernel)
     system = graph.linear(state)
     assert system.pose_keys.tolist() == problem.poses
     assert system.landmark_keys.tolist() == problem.landmarks

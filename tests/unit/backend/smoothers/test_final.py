@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from smoothing import SMOOTHERS, answer, ate, counting, drawn, run, wrong_matches
 
+from benchmarks.gtsam_graphs import in_arrays
 from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
-from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.backend.smoothers.final import graduated, trimmed
 from fgslam.core.arrays import FloatArray
 
@@ -51,7 +51,7 @@ def solved(
     method: Callable[..., Any], graph: Any, values: Any, kernel: KernelSettings
 ) -> tuple[Any, Any]:
     """GTSAM's values and factors that a treatment of outliers ends with."""
-    state, kept = method(*WholeGraph.of(graph, values, kernel))
+    state, kept = method(*in_arrays(graph, values, kernel))
     return kept.values(state), counting(graph, kept)
 
 
@@ -100,7 +100,7 @@ def test_graduated_non_convexity_finds_the_wrong_ones() -> None:
 
 def test_unseen_landmarks_are_those_of_which_no_observation_counts() -> None:
     estimator, _ = run(PLAIN, drawn(0).increments)
-    graph, _ = WholeGraph.of(estimator.builder.kept_factors(), estimator.solver.values)
+    graph, _ = in_arrays(estimator.builder.kept_factors(), estimator.solver.values)
     assert graph.unseen().tolist() == []
     assert graph.weighed(np.zeros(len(graph.weights))).unseen().tolist() == list(
         range(estimator.builder.variables)

@@ -1,0 +1,224 @@
+"""A measurement is one residual: the interface of models, and what estimators make of one.
+
+A user's model is ``predict`` over arrays, and perhaps ``start``. :func:`linearise` is what every
+estimator calls; derivatives are numeric where a model gives none. Derived in
+docs/derivations/measurements.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+import gtsam
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, Rows
+from fgslam.core.geometry import adjoint, inverse, se3_exp, skew, transform_to_camera, wrap
+from fgslam.core.sensors import CameraRig
+
+_STEP = 6e-6  # of a central difference: the third root of the rounding, where both errors are least
+
+
+class MeasurementModel:
+    """What a sensor measures: m numbers, of k moments at once.
+
+    Attributes:
+        kind: names it in logs, messages and tables.
+        size: m.
+        angles: which of the m are angles, whose differences are wrapped.
+        bTs: (4, 4) the sensor on the robot's body.
+    """
+
+    kind: ClassVar[str]
+    size: ClassVar[int]
+    angles: ClassVar[tuple[int, ...]] = ()
+    unpredicted: ClassVar[float] = 0.0  # residual of what cannot be predicted
+
+    def __init__(self, bTs: FloatArray | None = None) -> None:
+        """``bTs`` left out: the sensor's frame is the body's."""
+        self.bTs = np.eye(4) if bTs is None else np.asarray(bTs, np.float64)
+
+    def predict(self, x: FloatArray) -> FloatArray:
+        """(k, m) expected; NaN in a row that cannot be predicted."""
+        raise NotImplementedError
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """(k, m, d) derivatives of :meth:`predict`; by central differences, right to 1e-10."""
+        raise NotImplementedError
+
+    def start(
+        self, z: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None] | None:
+        """Where landmarks begin that are seen for the first time.
+
+        Args:
+            z: (k, m) measured.
+            covariance: (k, m, m) of it.
+
+        Returns:
+            Points (k, 3) in the sensor's frame; and covariances (k, 3, 3) of what is known of them
+            without this measurement, which then counts like any other, or None where it fixes
+            them by itself (m is 3). None alone: they wait until several measurements fix a point.
+        """
+        return None
+
+    def factor(self, keys: list[int], z: FloatArray, noise: Any, xTs: FloatArray) -> Any:
+        """The same as a C++ factor of GTSAM; None where there is none.
+
+        Args:
+            keys: of the pose, and of the landmark where there is one.
+            z: (m,) measured.
+            noise: GTSAM's model of its noise.
+            xTs: (4, 4) the sensor, in the frame of the pose variable.
+        """
+        return None
+
+
+class LandmarkModel(MeasurementModel):
+    """What is measured of landmarks: ``predict`` is given points (k, 3) in the sensor's frame."""
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """(k, m, 3) derivatives by the points; by central differences, right to 1e-10."""
+        step = _STEP * np.maximum(1.0, np.abs(x).max(axis=1, initial=0.0))[:, None]
+        ends = [(x + step * axis, x - step * axis) for axis in np.eye(3)]
+        return np.stack([_change(self, *both) / (2.0 * step) for both in ends], axis=2)
+
+
+class PoseModel(MeasurementModel):
+    """What is measured of the robot alone: ``predict`` is given poses ``wTs`` (k, 4, 4)."""
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """(k, m, 6) derivatives by the poses' tangents; by central differences."""
+        ends = [(x @ se3_exp(by), x @ se3_exp(-by)) for by in _STEP * np.eye(6)]
+        return np.stack([_change(self, *both) / (2.0 * _STEP) for both in ends], axis=2)
+
+
+def _change(model: MeasurementModel, ahead: FloatArray, behind: FloatArray) -> FloatArray:
+    return difference(model, model.predict(ahead), model.predict(behind))
+
+
+AnyModel: TypeAlias = MeasurementModel | CameraRig
+
+
+def difference(model: AnyModel, a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a - b`` (k, m) of two measurements, angles wrapped."""
+    out = a - b
+    for column in model.angles:
+        out[:, column] = wrap(out[:, column])
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearRows(Rows):
+    """Linearised measurements: ``residual + by_pose dx + by_point dl``.
+
+    Attributes:
+        residual: (k, m) predicted minus measured.
+        by_pose: (k, m, 6) by the tangent of the pose.
+        by_point: (k, m, 3) by the world point; of a pose alone (k, m, 0).
+        usable: (k,) which can be predicted; the others pull at nothing.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+    usable: BoolArray
+
+
+def residuals(
+    model: AnyModel,
+    poses: FloatArray,
+    points: FloatArray,
+    measured: FloatArray,
+    roots: FloatArray,
+) -> FloatArray:
+    """Whitened residuals (k, m), predicted minus measured; arguments of :func:`linearise`."""
+    return products(roots, _off(model, in_cameras(poses, points), measured)[0])
+
+
+def linearise(
+    model: AnyModel,
+    poses: FloatArray,
+    points: FloatArray | None,
+    measured: FloatArray,
+    roots: FloatArray | None = None,
+    xTs: FloatArray | None = None,
+) -> LinearRows:
+    """Measurements, predicted minus measured, with derivatives.
+
+    Args:
+        model: of the sensor.
+        poses: (k, 4, 4) of each measurement; of landmarks also one (4, 4) for all.
+        points: (k, 3) of its landmark, world; None for a model of poses.
+        measured: (k, m).
+        roots: (k, m, m) of :func:`whitening`; None leaves them as they are.
+        xTs: (4, 4) the sensor in the frame of the poses; None where they are its own.
+    """
+    at = poses if xTs is None else poses @ xTs
+    local = at if points is None else in_cameras(at, points)
+    off, usable = _off(model, local, measured)
+    safe = np.where(usable.reshape(-1, *[1] * (local.ndim - 1)), local, 1.0)
+    jacobian = model.jacobian(safe)
+    if roots is not None:
+        jacobian, off = roots @ jacobian, products(roots, off)
+    jacobian[~usable] = 0.0
+    if points is None:
+        by_pose, by_point = jacobian, np.empty((*off.shape, 0))
+    else:
+        by_pose = np.empty((*off.shape, 6))
+        by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
+        by_point = jacobian @ np.swapaxes(at[..., :3, :3], -1, -2)
+    if xTs is not None:
+        by_pose = by_pose @ adjoint(inverse(xTs))
+    return LinearRows(off, by_pose, by_point, usable)
+
+
+def _off(model: AnyModel, local: FloatArray, measured: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Residuals (k, m) at points or poses of the sensor, and which can be predicted (k,)."""
+    with np.errstate(all="ignore"):
+        off = difference(model, model.predict(local), measured)
+    usable = np.asarray(np.isfinite(off).all(axis=1))
+    off[~usable] = model.unpredicted
+    return off, usable
+
+
+def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """World points (k, 3) in the frames of poses ``wTc`` (k, 4, 4), one each, or of one (4, 4)."""
+    if poses.ndim == 2:
+        return transform_to_camera(poses, points)
+    offset = points - poses[:, :3, 3]
+    return np.asarray(np.einsum("kji,kj->ki", poses[:, :3, :3], offset))
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """(k, m, m) that turn residuals of covariances (k, m, m) into ones of unit covariance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(k, i) products of matrices (k, i, j) and vectors (k, j)."""
+    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+
+
+def gtsam_factor(
+    model: MeasurementModel, keys: list[int], z: FloatArray, noise: Any, xTs: FloatArray
+) -> Any:
+    """The model's C++ factor; where it has none, one that calls back, 30 to 400 us each.
+
+    Arguments are those of :meth:`MeasurementModel.factor`.
+    """
+    given = model.factor(keys, z, noise, xTs)
+    if given is not None:
+        return given
+
+    def error(_: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
+        poses = values.atPose3(keys[0]).matrix()[None]
+        points = values.atPoint3(keys[1])[None] if keys[1:] else None
+        rows = linearise(model, poses, points, z[None], xTs=xTs)
+        if jacobians is not None:
+            for place, by in zip(range(len(keys)), (rows.by_pose, rows.by_point), strict=False):
+                jacobians[place] = by[0]
+        return np.asarray(rows.residual[0])
+
+    return gtsam.CustomFactor(noise, keys, error)
