@@ -154,7 +154,9 @@ def test_covariance_is_the_scatter_of_poses() -> None:
     for _ in range(60):
         view = seen(place, truth, rng)
         here = RIG.predict(geometry.transform_to_camera(truth, place.points))
-        nearest = np.argmin(np.linalg.norm(view.measurement[:, None] - here[None], axis=2), axis=1)
+        nearest = np.nanargmin(
+            np.linalg.norm(view.measurement[:, None] - here[None], axis=2), axis=1
+        )
         pairs = Pairs.of(SeenPoints.of(view, RIG), np.arange(len(view)), exact, nearest)
         rows = np.zeros(len(view), np.int64)
         poses, covariances = refine(RIG, level, truth[None], pairs, rows, 6)
