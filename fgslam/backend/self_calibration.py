@@ -507,9 +507,9 @@ class WeighedCorrection:
 
 _KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motion's
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
-_ITERATIONS = 3  # more change the correction by a tenth of its sigma
-_TOLERANCE = 1e-4  # relative change of the cost at which a window has come to rest
-_LEAST_DAMPING = 1e-9
+_LANDMARKS = 200  # of a window: all that a street shows, 500, make it surer by a fifth
+_CELLS = np.array([8, 6])  # of the image, across and down, over which they are spread
+_DAMPING = 1e-6
 _NEAREST_M = 1e-2
 _LEAST_DISPARITY_PX = 0.5
 
@@ -612,21 +612,21 @@ class RigAlignment:
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._white = np.linalg.inv(np.linalg.cholesky(pixel_covariance(rig.cameras, rig.places)))
-        self._fuse = rig_map(rig)
 
     def evidence(self, known: FloatArray, precision: FloatArray) -> RigEvidence | None:
         """The window's evidence on the rig; None where it shows too little.
 
         Args:
-            known: (n,) of the rig so far; the minimisation starts and is held there.
+            known: (n,) of the rig so far; the adjustment starts and is held there.
             precision: (n, n) of that.
         """
         state = self._start(known)
         if state is None:
             return None
-        state = self._minimise(state, known, precision)
-        if state is None:
+        cost, moved = self._cost(state, known, precision), self._step(state, known, precision)
+        if moved is None:
             return None
+        state = moved if self._cost(moved, known, precision) <= cost else state
         normal, n = self._normal(self._predicted(state)), len(known)
         hessian, mixed = normal.hessian[:-n, :-n], normal.hessian[:-n, -n:]
         whole = normal.hessian.copy()
@@ -656,12 +656,27 @@ class RigAlignment:
         self._frame, self._pixels = self._frame[which][often], self._pixels[which][often]
         self._first = np.flatnonzero(np.diff(self._landmark, prepend=-1))
 
+    def _keep_some(self) -> None:
+        """Drops landmarks where there are many: in each cell of the image those seen least."""
+        size = [self._rig.width, self._rig.height]
+        at = np.clip(self._pixels[self._first, 0] * _CELLS // size, 0, _CELLS - 1)
+        seldom, cell = -np.bincount(self._landmark), at @ [_CELLS[1], 1.0]
+        order = np.lexsort((seldom, cell))
+        rank = np.arange(len(cell)) - np.searchsorted(cell[order], cell[order])
+        kept = order[np.lexsort((seldom[order], rank))][:_LANDMARKS]
+        self._keep(np.isin(self._landmark, kept))
+
     def _start(self, rig: FloatArray) -> _State | None:
         """Points from their first sighting; landmarks that fit none of it are left out."""
-        self._keep(self._measured(rig)[:, 2] > _LEAST_DISPARITY_PX)
-        if not self._first.size:
+        self._keep_some()
+        pixels = self._pixels[self._first]
+        moved = self._of.displacements(pixels) @ rig
+        measured = (pixels.reshape(moved.shape) - moved) @ rig_map(self._rig).T
+        near = measured[:, 2] > _LEAST_DISPARITY_PX
+        if not near.any():
             return None
-        local = self._rig.triangulate(self._measured(rig)[self._first])
+        self._keep(near[self._landmark])
+        local = self._rig.triangulate(measured[near])
         turn, place = self._poses[:, :3, :3], self._poses[:, :3, 3]
         at = self._frame[self._first]
         points = np.einsum("lij,lj->li", turn[at], local) + place[at]
@@ -673,14 +688,6 @@ class RigAlignment:
         if usable.sum() < self._of.terms:
             return None
         return _State(self._poses, still, points[usable], rig)
-
-    def _measured(self, rig: FloatArray) -> FloatArray:
-        """(column, row, disparity) (m, 3), corrected."""
-        moved = self._of.displacements(self._pixels) @ rig
-        return np.asarray((self._raw() - moved) @ self._fuse.T)
-
-    def _raw(self) -> FloatArray:
-        return self._pixels.reshape(-1, 2 * self._rig.cameras)
 
     def _local(self, state: _State) -> FloatArray:
         """Points (m, 3) in the cameras that see them."""
@@ -703,7 +710,7 @@ class RigAlignment:
         unit = self._of.displacements(pixels)
         shaken = unit[:, :, self._shaken]
         moved = unit @ state.rig + (shaken @ state.shakes[self._frame, :, None])[..., 0]
-        residual = (exact + moved - self._raw()) @ self._white.T / self._sigma
+        residual = (exact + moved - self._pixels.reshape(moved.shape)) @ self._white.T / self._sigma
         self._last = _Prediction(state, local, residual, unit, shaken)
         return self._last
 
@@ -716,23 +723,6 @@ class RigAlignment:
         shaken = float((state.shakes**2).sum()) / self._shake**2
         return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + shaken + off @ prior @ off)
 
-    def _minimise(self, state: _State, around: FloatArray, prior: FloatArray) -> _State | None:
-        damping, best = 1e-6, self._cost(state, around, prior)
-        for _ in range(_ITERATIONS):
-            normal = self._normal(self._predicted(state))
-            moved = self._step(state, normal, around, prior, damping)
-            if moved is None:
-                return None
-            cost = self._cost(moved, around, prior)
-            if cost > best:
-                damping *= 100.0
-                continue
-            rested = best - cost <= _TOLERANCE * best
-            state, best, damping = moved, cost, max(damping / 10.0, _LEAST_DAMPING)
-            if rested:
-                break
-        return state
-
     def _normal(self, found: _Prediction) -> _Normal:
         state, local, residual = found.state, found.local, found.residual
         squared = (residual**2).sum(axis=1)
@@ -740,7 +730,8 @@ class RigAlignment:
         by_local = root * (self._white @ self._model @ self._rig.jacobian(local))
         by_pose = by_local @ point_pose_jacobian(local)
         by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
-        of_pixels = root * (self._white @ np.concatenate([found.shaken, found.unit], axis=2))
+        of_pixels = np.concatenate([found.shaken, found.unit], axis=2)
+        of_pixels = root * np.einsum("ab,mbn->man", self._white, of_pixels)
         joint = np.concatenate([by_pose, of_pixels], axis=2)
         weighted = self._sigma * root[..., 0] * residual
         hessian, gradient = self._of_frames(state, joint, weighted)
@@ -748,12 +739,10 @@ class RigAlignment:
         curvature = np.add.reduceat(point_left @ by_point, self._first)
         curvature += 1e-9 * np.trace(curvature, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         pull = np.add.reduceat((point_left @ weighted[:, :, None])[..., 0], self._first)
-        coupling = self._coupling(np.swapaxes(joint, 1, 2) @ by_point)
-        inverse = np.linalg.inv(curvature)
-        eliminated = coupling @ inverse
-        flat = np.swapaxes(coupling, 1, 2).reshape(-1, len(gradient))
-        hessian -= np.swapaxes(eliminated, 1, 2).reshape(-1, len(gradient)).T @ flat
-        gradient = gradient - np.einsum("lnj,lj->n", eliminated, pull)
+        coupling, inverse = self._coupling(point_left @ joint), np.linalg.inv(curvature)
+        eliminated, flat = (of.reshape(-1, len(gradient)) for of in (inverse @ coupling, coupling))
+        hessian -= eliminated.T @ flat
+        gradient = gradient - pull.ravel() @ eliminated
         return _Normal(hessian, gradient, inverse, coupling, pull)
 
     def _of_frames(
@@ -775,26 +764,25 @@ class RigAlignment:
         return hessian[6:, 6:], out[6:]
 
     def _coupling(self, crossing: FloatArray) -> FloatArray:
-        """Points against frames and rig (l, n, 3), from observations (m, q + n, 3)."""
+        """Points against frames and rig (l, 3, n), from observations (m, 3, q + n)."""
         landmarks, frames, own = len(self._first), len(self._poses), 6 + len(self._shaken)
-        of_frames = np.zeros((landmarks, frames, own, 3))
-        of_frames[self._landmark, self._frame] = crossing[:, :own]
-        rig = np.add.reduceat(crossing[:, own:], self._first)
-        return np.concatenate([of_frames.reshape(landmarks, -1, 3)[:, 6:], rig], axis=1)
+        of_frames = np.zeros((landmarks, 3, frames, own))
+        of_frames[self._landmark, :, self._frame] = crossing[..., :own]
+        rig = np.add.reduceat(crossing[..., own:], self._first)
+        return np.concatenate([of_frames.reshape(landmarks, 3, -1)[..., 6:], rig], axis=2)
 
-    def _step(
-        self, state: _State, normal: _Normal, around: FloatArray, prior: FloatArray, damping: float
-    ) -> _State | None:
-        p = len(around)
-        hessian, gradient = normal.hessian.copy(), normal.gradient.copy()
+    def _step(self, state: _State, around: FloatArray, prior: FloatArray) -> _State | None:
+        """After a step of Gauss and Newton; another one changes a tenth of a sigma."""
+        normal, p = self._normal(self._predicted(state)), len(around)
+        hessian, gradient = normal.hessian, normal.gradient
         hessian[-p:, -p:] += prior
         gradient[-p:] += prior @ (state.rig - around)
-        hessian.flat[:: len(hessian) + 1] *= 1.0 + damping
+        hessian.flat[:: len(hessian) + 1] *= 1.0 + _DAMPING
         try:
             step = np.asarray(-np.linalg.solve(hessian, gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
-        pull = normal.point_gradient + np.einsum("lnj,n->lj", normal.coupling, step)
+        pull = normal.point_gradient + normal.coupling @ step
         points = state.points - np.einsum("lij,lj->li", normal.point_inverse, pull)
         moves = np.append(np.zeros(6), step[:-p]).reshape(len(state.poses), -1)
         poses = [moved_apart(T, xi[:6]) for T, xi in zip(state.poses, moves, strict=True)]
