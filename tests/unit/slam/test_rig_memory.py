@@ -113,7 +113,8 @@ def test_a_drive_begins_with_the_correction_that_others_found(memory: RigMemory)
     assert sigma < 0.5 * SelfCalibration(RIG, SIGMA_PX).found.applied.centre_px()[1]
     later = driven(memory, yaw(0.1), 1)
     assert later.found.estimated.centre_px()[1] < sigma
-    assert not (later.moved_before or later.knocks)
+    assert not later.moved_before
+    assert not later.knocks
 
 
 def test_what_a_drive_shows_is_kept_once(memory: RigMemory) -> None:
