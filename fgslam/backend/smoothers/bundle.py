@@ -18,9 +18,9 @@ from scipy.sparse import bsr_matrix, csr_matrix
 
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.elimination import (
-    BlockCholesky,
     Border,
     Bordered,
+    ChainMarginals,
     GraphMarginals,
     LinearSystem,
     SolvedSystem,
@@ -404,7 +404,7 @@ def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
 
 PLAIN = KernelSettings("none")
 _NONE: IntArray = np.empty(0, np.int64)
-_SLOW = 0.1  # of the last step's gain: beyond, a kept system has become another
+_SLOW = 0.3  # of the last step's gain: beyond, a kept system has become another
 _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
 
@@ -661,15 +661,15 @@ class WholeGraph:
 class Descent:
     """Steps towards the minimum, Gauss and Newton's or damped.
 
-    Near the minimum the poses' own system hardly changes from step to step: where it is kept, the
-    landmarks are eliminated again, and its factor, which is most of the work, serves on.
+    Near the minimum the system hardly changes from step to step: where it is kept, its factor,
+    which is most of the work, serves on.
     """
 
     def __init__(self, keeps: bool = True) -> None:
-        """No step yet; whether it keeps the poses' system."""
+        """No step yet; whether it keeps the system."""
         self._keeps = keeps
         self._damping = Damping()
-        self._factor: BlockCholesky | None = None
+        self._held: GraphMarginals | ChainMarginals | None = None
 
     def step(
         self, graph: WholeGraph, cost: float, state: State, last_gain: float
@@ -684,20 +684,23 @@ class Descent:
                 as each step gains a small part of that.
         """
         system = graph.linear(state)
-        if self._factor is not None:
-            found = self._kept(graph, state, system, self._factor)
+        if self._held is not None:
+            found = self._kept(graph, state, system, self._held)
             if found is not None and 0.0 <= cost - found[0] <= _SLOW * last_gain:
                 return found
-            self._factor = None
+            self._held = None
         return self._damping.step(cost, partial(self._tried, graph, state, system))
 
     def _kept(
-        self, graph: WholeGraph, state: State, system: LinearSystem, factor: BlockCholesky
+        self,
+        graph: WholeGraph,
+        state: State,
+        system: LinearSystem,
+        held: GraphMarginals | ChainMarginals,
     ) -> tuple[float, State] | None:
         """The step by a kept system; None where a landmark has become undetermined."""
         try:
-            kept = GraphMarginals.of(system.damped(0.0), factor)
-            return _after(graph, state, with_border(kept))
+            return _after(graph, state, with_border(held.stepping(system.damped(0.0))))
         except EstimatorError:
             return None
 
@@ -705,9 +708,8 @@ class Descent:
         self, graph: WholeGraph, state: State, system: LinearSystem, damping: float
     ) -> tuple[float, State]:
         solved = reduced(system.damped(damping))
-        held = solved.held if isinstance(solved, Bordered) else solved
-        if self._keeps and damping == 0.0 and isinstance(held, GraphMarginals):
-            self._factor = held.factor
+        if self._keeps and damping == 0.0:
+            self._held = solved.held if isinstance(solved, Bordered) else solved
         return _after(graph, state, solved)
 
 

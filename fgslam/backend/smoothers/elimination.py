@@ -617,14 +617,12 @@ class ChainSegment:
     Attributes:
         rows: (6k,) of the system's poses.
         columns: (c,) of what is kept that they depend on.
-        own: (k, 6, 6) their covariances if those are held.
         gain: (6k, c) how their mean follows those, negated.
         factor, size: of their information, scaled: Cholesky's band (12, 6k) and the scale (6k,).
     """
 
     rows: IntArray
     columns: IntArray
-    own: FloatArray
     gain: FloatArray
     factor: FloatArray
     size: FloatArray
@@ -649,9 +647,12 @@ class ChainSegment:
         columns = np.unique(coupling.indices).astype(np.int64)
         scaled = coupling[:, columns].toarray() / size[:, None]
         gain = cho_solve_banded((factor, True), scaled, check_finite=False)
-        blocks = size.reshape(-1, 6)
-        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
-        return ChainSegment(rows, columns, own, gain / size[:, None], factor, size), scaled.T @ gain
+        return ChainSegment(rows, columns, gain / size[:, None], factor, size), scaled.T @ gain
+
+    def own(self) -> FloatArray:
+        """(k, 6, 6) their covariances if what they depend on is held."""
+        size = self.size.reshape(-1, 6)
+        return _inverse_blocks(self.factor) / (size[:, :, None] * size[:, None, :])
 
     def alone(self, gradients: FloatArray) -> FloatArray:
         """(6k, c) their steps for gradients (6k, c) if what they depend on is held."""
@@ -788,28 +789,27 @@ class GraphMarginals:
     factor: BlockCholesky
 
     @staticmethod
-    def of(system: LinearSystem, factor: BlockCholesky | None = None) -> GraphMarginals:
+    def of(system: LinearSystem) -> GraphMarginals:
         """Eliminates the landmarks.
-
-        Args:
-            system: the graph.
-            factor: that of a system much like it, where steps are all that is asked for.
 
         Raises:
             EstimatorError: a landmark is not determined by its observations, or the poses are not.
         """
         if system.links.nnz:
             raise EstimatorError("landmarks depend on each other directly; no joint elimination")
-        with np.errstate(all="ignore"):
-            inverse = inverse_spd3(system.landmarks)
-        if not (np.isfinite(inverse).all() and (inverse[:, [0, 1, 2], [0, 1, 2]] > 0.0).all()):
-            raise EstimatorError("a landmark's observations do not determine it; no covariances")
-        if factor is not None:
-            return GraphMarginals(system, inverse, factor)
+        inverse = _own_inverses(system)
         information = system.poses.tobsr((6, 6))
         if system.coupling.nnz:
             information = information - _times(system.coupling, inverse) @ system.coupling.T
         return GraphMarginals(system, inverse, BlockCholesky(information))
+
+    def stepping(self, system: LinearSystem) -> GraphMarginals:
+        """Another system much like it, by the factor of this one: for steps alone.
+
+        Raises:
+            EstimatorError: a landmark is not determined by its observations.
+        """
+        return GraphMarginals(system, _own_inverses(system), self.factor)
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
@@ -860,6 +860,15 @@ class GraphMarginals:
         at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
         out[at[:, :, None], at[:, None, :]] += inverse
         return np.asarray(0.5 * (out + out.T))
+
+
+def _own_inverses(system: LinearSystem) -> FloatArray:
+    """(m, 3, 3) of each landmark's own block."""
+    with np.errstate(all="ignore"):
+        inverse = inverse_spd3(system.landmarks)
+    if not (np.isfinite(inverse).all() and (inverse[:, [0, 1, 2], [0, 1, 2]] > 0.0).all()):
+        raise EstimatorError("a landmark's observations do not determine it; no covariances")
+    return inverse
 
 
 def _seen_together(system: LinearSystem) -> csr_matrix:
@@ -943,6 +952,10 @@ class ChainMarginals:
             segments.append(segment)
         return ChainMarginals(system, segments, kept, DenseFactor(border))
 
+    def stepping(self, system: LinearSystem) -> ChainMarginals:
+        """Another system much like it, by the factors of this one: for steps alone."""
+        return replace(self, system=system)
+
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
         return self.solve(self.system.gradient[:, None])[:, 0]
@@ -966,9 +979,10 @@ class ChainMarginals:
         out = np.empty((len(self.system.pose_keys), 6, 6))
         out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
         for segment in self.segments:
-            gain = segment.gain.reshape(len(segment.own), 6, -1)
+            own = segment.own()
+            gain = segment.gain.reshape(len(own), 6, -1)
             among = covariance[np.ix_(segment.columns, segment.columns)]
-            out[segment.rows[::6] // 6] = segment.own + gain @ among @ np.swapaxes(gain, 1, 2)
+            out[segment.rows[::6] // 6] = own + gain @ among @ np.swapaxes(gain, 1, 2)
         return out
 
     def pose_columns(self, rows: IntArray) -> FloatArray:
@@ -997,7 +1011,7 @@ class ChainMarginals:
             at = np.flatnonzero(segment.rows == 6 * pose)
             if len(at):
                 first = int(at[0])
-                return segment.columns, segment.gain[first : first + 6], segment.own[first // 6]
+                return segment.columns, segment.gain[first : first + 6], segment.own()[first // 6]
         first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
         return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
 

@@ -224,7 +224,7 @@ def trimmed(graph: WholeGraph, state: State, noise_factor: float = 1.0) -> tuple
     """
     gate, descent = _GATE / noise_factor**2, Descent()
     if graph.weights.all():  # else it is known already what fits, but for a few
-        state = graph.minimum(state, ITERATIONS, _ROUGH)
+        state = graph.minimum(state, ITERATIONS, _ROUGH, descent=descent)
         control = _NEAR_BEGINS
         while control < _NEAR_ENDS:
             weights = truncated_weights(graph.squared(state) / gate, control)
@@ -495,6 +495,7 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
 
 
 _MOTIONS = 50  # that are judged, evenly spread: each costs a solution of the graph
+_AT_ONCE = 50_000  # blocks of covariances, 300 bytes each, that are solved for together
 
 
 def relative_covariances(
@@ -514,15 +515,17 @@ def relative_covariances(
     row_of = np.full(len(poses) + max(LAGS), -1)
     row_of[frames] = np.arange(len(frames))
     out = {lag: np.full((max(len(poses) - lag, 0), 6, 6), np.nan) for lag in LAGS}
-    for row in np.unique(np.linspace(0, len(frames) - 1, _MOTIONS).astype(np.int64)).tolist():
-        start = frames[row]
-        cross = np.swapaxes(marginals.pose_columns(np.array([row])).reshape(-1, 6, 6), 1, 2)
-        for lag in LAGS:
-            end, other = start + lag, row_of[start + lag]
-            if other >= 0:
-                motion = inverse(poses[start]) @ poses[end]
-                found = motion_covariance(motion, own[row], own[other], cross[other])
-                out[lag][start] = floor.allowed_part(poses[end], found)
+    rows = np.unique(np.linspace(0, len(frames) - 1, _MOTIONS).astype(np.int64))
+    for some in np.array_split(rows, len(rows) * len(frames) // _AT_ONCE + 1):
+        columns = marginals.pose_columns(some).reshape(len(frames), 6, len(some), 6)
+        for k, row in enumerate(some.tolist()):
+            start, cross = frames[row], np.swapaxes(columns[:, :, k], 1, 2)
+            for lag in LAGS:
+                end, other = start + lag, row_of[start + lag]
+                if other >= 0:
+                    motion = inverse(poses[start]) @ poses[end]
+                    found = motion_covariance(motion, own[row], own[other], cross[other])
+                    out[lag][start] = floor.allowed_part(poses[end], found)
     return out
 
 

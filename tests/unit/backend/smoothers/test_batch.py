@@ -87,7 +87,7 @@ def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
 def test_failing_solver_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     estimator, _ = run(BatchSettings(), drawn(7, frames=6).increments)
 
-    def failing(*arguments: object) -> None:
+    def failing(*arguments: object, **named: object) -> None:
         raise RuntimeError("\nout of\nluck\n")
 
     monkeypatch.setattr(WholeGraph, "minimum", failing)
