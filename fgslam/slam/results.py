@@ -103,6 +103,12 @@ class RunRecorder:
         self.noise.append(report.noise)
         self.most_stereo = max(self.most_stereo, row.stereo)
 
+    @property
+    def online(self) -> Trajectory:
+        """Each pose as it was first estimated, at its own time."""
+        poses = np.array(self.online_poses).reshape(-1, 4, 4)
+        return Trajectory(self.log.timestamps, poses)
+
     def column(self, name: str) -> npt.NDArray[Any]:
         """One number of all frames."""
         return np.array([getattr(row, name) for row in self.rows])
@@ -279,7 +285,7 @@ def result_of(
     Where the estimator ``failed`` in the frame after them, it may have taken in a part of that
     frame, and may have no answer any more.
     """
-    online = Trajectory(recorder.log.timestamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    online = recorder.online
     covariances = np.array(recorder.online_covariances).reshape(-1, 6, 6)
     if failed:
         estimate, _ = estimate_of_failed(pipeline.estimator, online, covariances)

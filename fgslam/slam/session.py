@@ -22,7 +22,7 @@ from fgslam.core.geometry import is_rigid
 from fgslam.core.log import Frame, MeasurementLog
 from fgslam.core.sensors import CameraRig, Odometry, compose_odometry
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import Remark
+from fgslam.core.types import LandmarkMap, Remark, Trajectory
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.features.sift import grey_image
@@ -318,6 +318,20 @@ class Session:
         return len(self.recorder)
 
     # -- results -------------------------------------------------------------------------------
+
+    @property
+    def path(self) -> Trajectory:
+        """Each pose so far as it was first estimated: in microseconds, without a solution."""
+        return self.recorder.online
+
+    @property
+    def landmarks(self) -> LandmarkMap:
+        """The map as the next frame is matched to it: without a solution, in microseconds.
+
+        A smoother's covariances are here given the poses; :meth:`result` has marginals. The arrays
+        are good until the next frame.
+        """
+        return self.pipeline.estimator.landmarks()
 
     def result(self) -> SessionResult:
         """Trajectory, covariances and map as known now; tracking may go on afterwards.

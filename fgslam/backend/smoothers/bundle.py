@@ -708,8 +708,9 @@ class Descent:
         self, graph: WholeGraph, state: State, system: LinearSystem, damping: float
     ) -> tuple[float, State]:
         solved = reduced(system.damped(damping))
-        if self._keeps and damping == 0.0:
-            self._held = solved.held if isinstance(solved, Bordered) else solved
+        held = solved.held if isinstance(solved, Bordered) else solved
+        if self._keeps and damping == 0.0 and not isinstance(held, Bordered):
+            self._held = held
         return _after(graph, state, solved)
 
 

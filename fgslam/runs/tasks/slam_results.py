@@ -29,7 +29,7 @@ from fgslam.core.log import (
 )
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig, moved_pixels
-from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures, Trajectory
+from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures
 from fgslam.datasets.ledger import UNITS, Entry, as_values
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
@@ -553,8 +553,7 @@ class RunOutputs:
         estimate = self.pipeline.estimate()
         self.recorder.log.save(self.folder / LOG_FILE)
         truth = self._write_truth(with_landmarks=status == "finished")
-        online = np.array(self.recorder.online_poses).reshape(-1, 4, 4)
-        online_path = Trajectory(estimate.trajectory.timestamps, online)
+        online_path = self.recorder.online
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         own = make_subfolder(self.folder, self.title)
         frame, rig = self.sequence.truth_frame, self.sequence.rig

@@ -155,6 +155,20 @@ def test_a_step_reports_what_was_matched(views: Views) -> None:
     assert np.isin(second.matches.ids, first.new.ids).all()
 
 
+def test_path_and_landmarks_are_live(views: Views) -> None:
+    """After each frame, without a solution: poses as they came, the map that steps report."""
+    slam = session(views, "sliding_window")
+    steps = []
+    for i in range(FRAMES):
+        push(slam, views, range(i, i + 1))
+        assert len(slam.path) == i + 1
+        steps.append((slam.path.poses[-1], len(slam.landmarks)))
+    online = slam.result().online
+    np.testing.assert_array_equal(online.poses, [pose for pose, _ in steps])
+    assert steps[-1][1] == len(slam.result().estimate.landmarks) > 0
+    assert steps[0][1] > 0
+
+
 @pytest.mark.parametrize("estimator", ["landmark_kalman", "isam2", "fixed_lag"])
 def test_results_asked_for_between_frames_change_nothing(views: Views, estimator: str) -> None:
     asked = session(views, estimator)
