@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from fgslam.homing.steering import DriveCommand
     from fgslam.homing.topological_map import RouteMap
     from fgslam.report.figures import plot
+    from fgslam.runs.judge import judge
     from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.session import Map, Result, Slam
     from fgslam.slam.feature_stream import FeatureExtractor
@@ -71,6 +72,7 @@ __all__ = [
     "__version__",
     "compare",
     "errors",
+    "judge",
     "load_camera",
     "load_rig",
     "open_recording",
@@ -105,6 +107,7 @@ _HOMES = {
     "Trajectory": "fgslam.core.types",
     "TwoViewVector": "fgslam.core.bearings",
     "compare": "fgslam.evaluation.judging",
+    "judge": "fgslam.runs.judge",
     "load_camera": "fgslam.cameras.omni_files",
     "load_rig": "fgslam.cameras.rig",
     "open_recording": "fgslam.runs.library",

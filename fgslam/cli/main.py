@@ -292,6 +292,44 @@ def compare(  # noqa: PLR0913 - each option is a parameter
 
 
 @command(app)
+def judge(
+    estimates: list[str],
+    truth: str | None = None,
+    covariance: Path | None = None,
+    tangent: str = "",
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Hold the covariances of trajectories against their errors, whichever program made them.
+
+    Reads TUM, EuRoC, OpenVINS and cnspy files, topics of ROS bags (BAG:/topic) and run folders.
+    NEES is 1 where covariances are right; the last column is what mends them. What no file states
+    of a covariance is told from the errors, and marked as a guess. Without --truth a run of fgslam
+    is judged by two halves of its landmarks.
+
+    Args:
+        estimates (ESTIMATE...): files of poses, BAG:/topic, run folders or estimators' in them
+        truth (FILE): true poses, of the same kinds of files
+        covariance (FILE): covariances of the one estimate, a row a pose, in a file of their own
+        tangent (WORDS): what they are of: rotation_first or translation_first, local, global,
+            split_local or split_global, degrees; with commas; what is left out is guessed
+        out (--run OUT): folder for the numbers and the page with figures; default none
+        overwrite: replace an earlier one
+    """
+    from fgslam.cli.console import show_parts
+    from fgslam.core.files import require_output
+    from fgslam.runs.judge import judge as judged
+    from fgslam.runs.judge import write_judged
+
+    if out is not None:
+        files = [truth, covariance, *estimates]
+        require_output(out, overwrite, [Path(f) for f in files if f is not None], folder=True)
+    found = judged(estimates, truth, covariance, tangent)
+    written = [("page", str(write_judged(found, out)))] if out is not None else []
+    show_parts((), found.text_tables(), [*(("note", n) for n in found.notes), *written])
+
+
+@command(app)
 def sweep(  # noqa: PLR0913 - each option is a parameter
     experiments: options.Experiments,
     axes: list[str] | None = None,

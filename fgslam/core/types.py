@@ -374,7 +374,7 @@ class Trajectory(Brief):
         path = as_path(path, DatasetError)
         expected = "timestamp tx ty tz qx qy qz qw on each line"
         text = read_text(path, remedy=f"check the path; it has {expected}")
-        values, lines = _parse_rows(path, text, 8, expected)
+        values, lines = parse_rows(path, text, 8, expected)
         backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
         for bad, what in (
             (~np.isfinite(values).all(axis=1), "a number is not finite; repair or remove the line"),
@@ -443,7 +443,7 @@ def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
     text = read_text(path, remedy="give a covariance.csv").replace(_COVARIANCE_HEADER, "", 1)
     columns = 1 + len(_COVARIANCE_NAMES)
     expected = "timestamp and 21 covariances, separated by commas"
-    values, _ = _parse_rows(path, text.replace(",", " "), columns, expected)
+    values, _ = parse_rows(path, text.replace(",", " "), columns, expected)
     return values[:, 0].copy(), from_upper(values[:, 1:], 6)
 
 
@@ -457,7 +457,7 @@ def _rows_text(rows: FloatArray, row_format: str) -> str:
     return buffer.getvalue()
 
 
-def _parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[FloatArray, IntArray]:
+def parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[FloatArray, IntArray]:
     """Numbers (n, columns) and the line number (n,) of each row; `#` starts a comment."""
     rows: list[list[float]] = []
     lines: list[int] = []

@@ -299,6 +299,11 @@ class Bag:
         except (StopIteration, FrameError, DatasetError):
             return ""
 
+    def decoded(self, topic: str) -> Iterator[Any]:
+        """Every message of a topic. Raises DatasetError at damage, FrameError of a message."""
+        for connection, _, raw in self._messages((topic,)):
+            yield self._decoded(connection, raw)
+
     def depth_scale(self, topic: str) -> float | None:
         """Units of depth in a metre by the topic that states metres a unit; None where none does.
 

@@ -391,7 +391,7 @@ def _online(
 def _innovations(answer: Answer) -> dict[str, JsonValue]:
     """NIS of the matched observations, each frame an independent item."""
     known = np.isfinite(answer.nis) & (answer.nis_dof > 0)
-    found = judge([Nees(answer.nis[known], answer.nis_dof[known])], items_independent=True)
+    found = judge([Nees(answer.nis[known], answer.nis_dof[known])], independent=np.inf)
     return {"nis_per_dof": _per_dof(found), "nis": _as_json(found)}
 
 
@@ -596,7 +596,7 @@ def _frame(estimators: Mapping[str, EstimatorMetrics]) -> pandas.DataFrame:
 
 def _judged(name: str, answer: Comparable, truth: Truth) -> EstimatorMetrics:
     if isinstance(answer, Estimate):
-        answer = _alone(answer)
+        answer = lone_answer(answer)
     if isinstance(answer, Answer):
         return judge_answer(answer, truth).metrics
     if not hasattr(answer, "estimate"):
@@ -607,7 +607,7 @@ def _judged(name: str, answer: Comparable, truth: Truth) -> EstimatorMetrics:
     return judge_replay(answer, truth).metrics
 
 
-def _alone(estimate: Estimate) -> Answer:
+def lone_answer(estimate: Estimate) -> Answer:
     """An estimate of which nothing else is known: neither online poses nor times."""
     online = Trajectory(np.empty(0), np.empty((0, 4, 4)))
     none = np.empty(0)

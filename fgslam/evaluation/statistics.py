@@ -449,7 +449,7 @@ def chi_square_band(dof: float, probability: float = 0.95) -> tuple[float, float
 
 
 def judge(
-    runs: Sequence[Nees], probability: float = 0.95, *, items_independent: bool = False
+    runs: Sequence[Nees], probability: float = 0.95, *, independent: float | None = None
 ) -> Consistency | None:
     """NEES of one or more runs and its chi-square band, and whether it lies inside.
 
@@ -462,8 +462,8 @@ def judge(
     Args:
         runs: NEES of independent runs (different seeds).
         probability: of the band.
-        items_independent: count every item as independent, for errors that are (innovations,
-            one frame of many runs).
+        independent: how many items count as independent; infinite: every one, for errors that are
+            (innovations, one frame of many runs).
 
     Returns:
         The comparison, or None when no run has a degree of freedom.
@@ -475,13 +475,13 @@ def judge(
         return None
     total = float(dof.sum())
     informative_runs = sum(bool(run.dof.any()) for run in runs)
-    independent = items if items_independent else informative_runs
+    independent = min(items, informative_runs if independent is None else independent)
     lower, upper = chi_square_band(total * independent / items, probability)
     per_dof = float(values.sum()) / total
     verdict: ConsistencyVerdict = "overconfident" if per_dof > upper else "consistent"
     if per_dof < lower:
         verdict = "conservative"
-    return Consistency(per_dof, lower, upper, probability, items, independent, verdict)
+    return Consistency(per_dof, lower, upper, probability, items, round(independent), verdict)
 
 
 JsonValue: TypeAlias = (

@@ -267,12 +267,12 @@ def simulated_run(seed: int, inflation: float) -> Nees:
 )
 def test_wrong_covariances_are_recognised_over_many_runs(inflation: float, verdict: str) -> None:
     runs = [simulated_run(seed, inflation) for seed in range(10)]
-    for independent in (False, True):
-        result = judge(runs, items_independent=independent)
+    for independent, counted in ((None, 10), (np.inf, 600)):
+        result = judge(runs, independent=independent)
         assert result is not None
         assert result.verdict == verdict
         assert result.items == 600
-        assert result.independent == (600 if independent else 10)
+        assert result.independent == counted
         assert result.per_dof == pytest.approx(1.0 / inflation, rel=0.1)
 
 
