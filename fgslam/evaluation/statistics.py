@@ -407,7 +407,10 @@ def best_aligned(estimate: FloatArray, covariances: FloatArray, truth: FloatArra
     weights = np.linalg.pinv(found, rcond=_RELATIVE_RANK_TOLERANCE, hermitian=True)
     by_world = adjoint(inverse(estimate))  # of a motion of the truth's world, at each pose
     pull = np.swapaxes(by_world, 1, 2) @ weights
-    inverse_information = np.linalg.pinv((pull @ by_world).sum(axis=0), hermitian=True)
+    information = (pull @ by_world).sum(axis=0)
+    inverse_information = np.linalg.pinv(
+        information, rcond=_RELATIVE_RANK_TOLERANCE, hermitian=True
+    )
     for _ in range(_ROUNDS):
         errors = pose_errors(estimate, truth)
         step = -inverse_information @ np.einsum("nij,nj->i", pull, errors)

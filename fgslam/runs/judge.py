@@ -16,7 +16,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.files import as_path, make_subfolder
-from fgslam.core.geometry import adjoint, inverse, pose
+from fgslam.core.geometry import adjoint, change_tangent_frame, inverse, pose
 from fgslam.core.log import MeasurementLog
 from fgslam.core.types import LAGS, Estimate, Trajectory
 from fgslam.datasets.stated import TANGENT_WORDS, StatedPoses, read_stated
@@ -100,7 +100,8 @@ class JudgedEstimates:
     Attributes:
         values: numbers of each by name, as metrics.json has them.
         notes: what was guessed, assumed or left out, in words.
-        estimates: poses with covariances in the tangent space at them, [rotation, translation].
+        estimates: in the truth's world, the first pose aligned; covariances in the tangent space
+            at the poses, [rotation, translation].
         truth: true poses that each was judged by.
     """
 
@@ -141,7 +142,11 @@ class JudgedEstimates:
         """The page: errors next to three stated deviations, along axes and over time, and NEES."""
         known = next(iter(self.truth.values()))
         found = tuple(
-            judged_report(name, name, one, None, self.truth[name])
+            replace(
+                judged_report(name, name, one, None, self.truth[name]),
+                verdict=value_at(self.values[name], "nees.pose.verdict"),
+                nees_per_dof=value_at(self.values[name], "nees.pose.per_dof"),
+            )
             for name, one in self.estimates.items()
         )
         return ReportData(
@@ -216,7 +221,7 @@ def judge(
         stated, run = _opened(one, None if covariance is None else Path(covariance))
         about: dict[str, JsonValue] = {"tangent_guessed": False}
         if true is None:
-            space = Tangent()
+            space, turned = Tangent(), np.eye(4)
             estimate, by = _halves(name, stated.trajectory, run)
             covariances = estimate.covariances
             notes.append(_HALVES)
@@ -224,8 +229,10 @@ def judge(
             by = _of_same_frame(name, stated, true, run)
             covariances = _covariances(name, stated)
             _require_same_times(name, stated.trajectory, by)
-            if not np.array_equal(axes := turned_axes(stated.trajectory, by), np.eye(3)):
-                by = replace(by, poses=by.poses @ pose(axes, np.zeros(3)))
+            axes = turned_axes(stated.trajectory, by)
+            turned = pose(axes, np.zeros(3))
+            if not np.array_equal(axes, np.eye(3)):
+                by = replace(by, poses=by.poses @ turned)
                 notes.append(f"{name}: x, y, z are {_axes_words(axes)} of the truth (guess)")
             found = guess_tangent(
                 stated.trajectory, covariances, by, stated.words | words, stated.usual
@@ -257,7 +264,7 @@ def judge(
             "tangent": str(space),
             **about,
         }
-        estimated[name], truths[name] = estimate, by
+        estimated[name], truths[name] = _as_drawn(estimate, by, turned)
     return JudgedEstimates(values, tuple(dict.fromkeys(notes)), estimated, truths)
 
 
@@ -383,6 +390,19 @@ def _numbers(
     judged = credibility(space, path.poses[rows], stated[rows], true)
     metrics = judge_answer(lone_answer(estimate), Truth(truth)).metrics.as_json()
     return metrics | asdict(judged)
+
+
+def _as_drawn(
+    estimate: Estimate, truth: Trajectory, turned: FloatArray
+) -> tuple[Estimate, Trajectory]:
+    """Both as poses of what the truth is of, in its world, the first pose aligned: to be drawn."""
+    path, back = estimate.trajectory, inverse(turned)
+    rows, of = associate(path.timestamps, truth.timestamps)
+    world = truth.poses[of[0]] @ inverse(path.poses[rows[0]])
+    moved = replace(path, poses=world @ path.poses @ back)
+    covariances = change_tangent_frame(turned, estimate.covariances)
+    known = replace(truth, poses=truth.poses @ back)
+    return replace(estimate, trajectory=moved, covariances=covariances), known
 
 
 def _halves(

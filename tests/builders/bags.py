@@ -188,20 +188,22 @@ class Maker:
             values |= {"roi": roi}
             if self.ros1:
                 values = {k.upper() if len(k) == 1 else k: v for k, v in values.items()}
-        elif kind.endswith("Odometry"):
+        elif kind.endswith(("Odometry", "PoseWithCovarianceStamped")):
             x, y, z, qx, qy, qz, qw = fields["pose"]
             pose = self._make(
                 "geometry_msgs/msg/Pose",
                 self._make("geometry_msgs/msg/Point", x, y, z),
                 self._make("geometry_msgs/msg/Quaternion", qx, qy, qz, qw),
             )
-            values = {
-                "child_frame_id": fields.get("child", "base_link"),
-                "pose": self._make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
-                "twist": self._make(
-                    "geometry_msgs/msg/TwistWithCovariance", self._twist(0.0, 0.0), np.zeros(36)
-                ),
-            }
+            covariance = fields.get("covariance", np.zeros(36))
+            held = self._make("geometry_msgs/msg/PoseWithCovariance", pose, covariance)
+            values = {"pose": held}
+            if kind.endswith("Odometry"):
+                twist = self._twist(0.0, 0.0), np.zeros(36)
+                values |= {
+                    "child_frame_id": fields.get("child", "base_link"),
+                    "twist": self._make("geometry_msgs/msg/TwistWithCovariance", *twist),
+                }
         elif kind.endswith("TwistStamped"):
             values = {"twist": self._twist(*fields["twist"])}
         elif kind.endswith("Float32"):
