@@ -36,6 +36,8 @@ _GROWN = 0.9  # share of steps
 _FEWEST = 10  # poses: fewer decide nothing
 _EXCLUDED = 1e-4  # of the mean variance of all axes: what lies below is no uncertainty
 _CLEARLY = 0.25  # of the misfit of motions, below which turned axes are taken
+_STRAIGHT = 0.1  # radians
+_OFF = 3.0  # deviation of the logarithm of the variance by which estimators are off
 _PER_RADIAN = np.degrees(1.0)
 
 
@@ -105,10 +107,11 @@ def guess_tangent(
 ) -> Guess:
     """The tangent space in which the errors are likeliest, of those that the words leave open.
 
-    Errors are taken as normal with the stated covariance times one factor, which is estimated; a
-    log likelihood counts as many errors as are independent. Of what is not far less likely than
-    the best, those are kept in which covariances only grow, as by dead reckoning, if there are
-    any; of these radians, and the ``usual`` space; else the likeliest.
+    Errors are taken as normal with the stated covariance times one factor, which is estimated and
+    hardly more than 400; a log likelihood counts as many errors as are independent. Of what is not
+    far less likely than the best, those are kept in which covariances only grow, as by dead
+    reckoning, if there are any; of these the ``usual`` space, else the likeliest. Degrees are taken
+    only where they are far likelier.
     """
     spaces = ("local", "global", "split_local", "split_global")
     choices = [
@@ -123,23 +126,32 @@ def guess_tangent(
     poses, stated = estimate.poses[rows], covariances[rows]
     errors = {space: Tangent(space=space).errors(poses, true) for space in spaces}
     fits = [_misfit(one, errors[one.space], stated) for one in choices]
+    many = len(rows) >= _FEWEST
+    count = min(independent_count(series) for *_, series in fits) if many else 0.0
     # Rounded, so that of equals the first is taken.
-    cost = dict(zip(choices, (round(mean, 9) for mean, _ in fits), strict=True))
-    count = min(independent_count(series) for _, series in fits) if len(rows) >= _FEWEST else 0.0
+    cost = {
+        one: round(count * misfit + 0.5 * (factor / _OFF) ** 2, 9)
+        for one, (misfit, factor, _) in zip(choices, fits, strict=True)
+    }
 
     def decides(better: Tangent, other: Tangent) -> bool:
-        return 0.5 * count * (cost[other] - cost[better]) > _LIKELIER
+        return cost[other] - cost[better] > _LIKELIER
 
-    best, overall = min(allowed, key=cost.__getitem__), min(choices, key=cost.__getitem__)
+    overall = min(choices, key=cost.__getitem__)
+    radians = [one for one in allowed if one.unit == "radians"]
+    if radians and (
+        overall.unit == "radians" or not decides(overall, min(radians, key=cost.__getitem__))
+    ):
+        allowed = radians
+    best = min(allowed, key=cost.__getitem__)
     likely = [one for one in allowed if not decides(best, one)]
     grown = [one for one in likely if _grows(one, estimate.poses, covariances)]
     kept = grown or likely
-    plain = [one for one in kept if one.unit == "radians"] or kept
-    taken = min([c for c in plain if c.space == usual] or plain, key=cost.__getitem__)
+    taken = min([c for c in kept if c.space == usual] or kept, key=cost.__getitem__)
     fitting = overall if decides(overall, taken) else None
     if len({(c.order, c.space) for c in allowed}) == 1:
         return Guess(taken, "stated", False, fitting)
-    others = [str(one) for one in plain if one != taken][:3]
+    others = [str(one) for one in dict.fromkeys((*kept, overall)) if one != taken][:3]
     doubt = f", not surely: perhaps {' or '.join(others)}" if others else ""
     why = "covariances grow as those of dead reckoning, " if 0 < len(grown) < len(likely) else ""
     return Guess(taken, f"guess: {why}the likeliest given the errors{doubt}", True, fitting)
@@ -147,12 +159,16 @@ def guess_tangent(
 
 def _grows(tangent: Tangent, poses: FloatArray, stated: FloatArray) -> bool:
     """Whether covariances grow as by dead reckoning in this space, by no negative covariance."""
-    found = accumulated(poses, tangent.to_local(poses, stated)).get(1, np.full((1, 6, 6), np.nan))
-    return float(np.isfinite(found).all(axis=(1, 2)).mean()) > _GROWN
+    local = tangent.to_local(poses, stated)
+    found = accumulated(poses, local).get(1, np.full((1, 6, 6), np.nan))
+    gained, had = (np.trace(c, axis1=1, axis2=2) for c in (found, local[1:]))
+    return bool((gained > 1e-6 * had).mean() > _GROWN)
 
 
-def _misfit(tangent: Tangent, errors: FloatArray, stated: FloatArray) -> tuple[float, FloatArray]:
-    """Twice the negative log likelihood a pose, without what all share, and the NEES (n,)."""
+def _misfit(
+    tangent: Tangent, errors: FloatArray, stated: FloatArray
+) -> tuple[float, float, FloatArray]:
+    """Negative log likelihood a pose without what all share, log of the factor, and NEES (n,)."""
     covariances = tangent.ordered(stated)
     # What a covariance excludes, as motion off a floor, has no say but where it is contradicted.
     usual = (
@@ -161,7 +177,7 @@ def _misfit(tangent: Tangent, errors: FloatArray, stated: FloatArray) -> tuple[f
     found = nees(errors, covariances + _EXCLUDED * np.diag(np.repeat(usual, 3)))
     known = found.dof > 0
     if not known.any():
-        return 0.0, np.zeros(1)
+        return 0.0, 0.0, np.zeros(1)
     turns, steps = (  # directions that are uncertain
         float((spread > _EXCLUDED * spread[:, -1:]).sum(axis=1).mean())
         for spread in map(
@@ -171,7 +187,8 @@ def _misfit(tangent: Tangent, errors: FloatArray, stated: FloatArray) -> tuple[f
     dof = turns + steps
     mean = max(float(found.values[known].mean()) / max(dof, 1.0), np.finfo(float).tiny)
     unit = 2.0 * turns * np.log(_PER_RADIAN) if tangent.unit == "degrees" else 0.0
-    return dof * float(np.log(mean)) - unit, found.values[known]
+    factor = float(np.log(mean))
+    return 0.5 * (dof * factor - unit), factor, found.values[known]
 
 
 def turned_axes(estimate: Trajectory, truth: Trajectory) -> FloatArray:
@@ -181,24 +198,24 @@ def turned_axes(estimate: Trajectory, truth: Trajectory) -> FloatArray:
     both agree far better so.
     """
     rows, of = associate(estimate.timestamps, truth.timestamps)
-    both = estimate.poses[rows], truth.poses[of]
-    motions = [inverse(poses[:-1]) @ poses[1:] for poses in both]
-    turns, steps = (
-        [part / max(float(np.linalg.norm(parts[1])), 1e-9) for part in parts]
-        for parts in (
-            [pose_errors(np.broadcast_to(np.eye(4), one.shape), one)[:, :3] for one in motions],
-            [one[:, :3, 3] for one in motions],
-        )
+    ours, true = (
+        pose_errors(np.broadcast_to(poses[0], poses.shape), poses)
+        for poses in (estimate.poses[rows], truth.poses[of])
     )
+    # Of a straight drive the turns are noise.
+    turned = float((true[:, :3] ** 2).sum()) + len(rows) * _STRAIGHT**2
+    moved = max(float((true[:, 3:] ** 2).sum()), 1e-9)
     signed = (
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in itertools.permutations(range(3))
         for signs in itertools.product((1.0, -1.0), repeat=3)
     )
-    axes: list[FloatArray] = [
-        one for one in signed if np.linalg.det(one) > 0.0
-    ]  # the identity first
-    misfits = [sum(float(((a - b @ one) ** 2).sum()) for a, b in (turns, steps)) for one in axes]
+    axes: list[FloatArray] = [one for one in signed if np.linalg.det(one) > 0.0]  # identity first
+    misfits = [
+        float(((ours[:, :3] - true[:, :3] @ one) ** 2).sum() / turned)
+        + float(((ours[:, 3:] - true[:, 3:] @ one) ** 2).sum() / moved)
+        for one in axes
+    ]
     best = int(np.argmin(misfits))
     return axes[best] if misfits[best] < _CLEARLY * misfits[0] else axes[0]
 

@@ -1,0 +1,92 @@
+"""`fgslam judge` on a run of ours: its own numbers, its bag, its halves, its page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from running import Capture, Patch, main, units_in_this_process
+
+import fgslam as fg
+from fgslam.core.log import MeasurementLog
+from fgslam.runs.config import make_config
+from fgslam.runs.judge import half_of
+from fgslam.runs.run import run_experiment
+
+KIND = "landmark_kalman"
+VALUES: dict[str, Any] = {
+    "name": "drive",
+    "dataset": {"kind": "simulated_measurements", "stop": 40, "detection": {"features": 40}},
+    "output": {"report": False, "pictures": False},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on simulated measurements; read only."""
+    folder = tmp_path_factory.mktemp("judge") / "drive"
+    with units_in_this_process():
+        run_experiment(make_config(VALUES, "test"), folder)
+    return folder
+
+
+def test_the_numbers_of_a_run_are_its_own(run: Path) -> None:
+    own = json.loads((run / "metrics.json").read_text())["estimators"][KIND]
+    judged = fg.judge(run, run / "ground_truth.tum")
+    found = judged.values["drive"]
+    assert found["nees_pose"]["per_dof"] == pytest.approx(own["nees_pose"]["per_dof"], rel=1e-5)
+    assert found["nees"]["pose"]["per_dof"] == pytest.approx(own["nees_pose_per_dof"], rel=1e-5)
+    assert found["ate_rmse_m"] == pytest.approx(own["ate_rmse_m"], rel=1e-5)
+    assert found["nees_relative"] == own["nees_relative"]
+    assert "motions are judged by the joint covariances of the run" in judged.notes
+
+
+def test_the_same_estimate_in_a_bag_is_judged_alike(
+    run: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """Through an export with the axes of a robot, another world, order and tangent space."""
+    bag = tmp_path / "drive.mcap"
+    assert main(monkeypatch, "export", run, "--trajectory", bag) == 0
+    truth = run / "ground_truth.tum"
+    ours, theirs = (fg.judge(one, truth).table() for one in (run, bag))
+    for name in ("nees_pose_per_dof", "nees_rotation_per_dof", "sigma_factor_pose", "ate_rmse_m"):
+        assert theirs.loc["drive", name] == pytest.approx(ours.loc["drive", name], rel=1e-3)
+
+
+def test_halves_of_the_landmarks_judge_a_run_without_truth(run: Path) -> None:
+    judged = fg.judge(run)
+    assert any("two halves of the landmarks" in note for note in judged.notes)
+    assert 0.2 < judged.table().loc["drive", "nees_pose_per_dof"] < 3.0
+    with pytest.raises(fg.errors.ConfigError, match="is no run of fgslam"):
+        fg.judge(run / "ground_truth.tum")
+
+
+def test_halves_share_no_landmark_and_lose_none(run: Path) -> None:
+    log = MeasurementLog.load(run / "measurements.npz")
+    halves = [half_of(log, k) for k in (0, 1)]
+    for whole, first, second in zip(log, *halves, strict=True):
+        parts = [one.observations.ids for one in (first, second)]
+        assert not np.intersect1d(*parts).size
+        np.testing.assert_array_equal(
+            np.sort(np.concatenate(parts)), np.sort(whole.observations.ids)
+        )
+        assert len(first.rejected) == len(parts[0])
+
+
+def test_the_command_prints_tables_and_writes_numbers_and_page(
+    run: Path, tmp_path: Path, capfd: Capture, monkeypatch: Patch
+) -> None:
+    out = tmp_path / "out"
+    arguments = ("judge", run, "--truth", run / "ground_truth.tum", "--run", out)
+    assert main(monkeypatch, *arguments) == 0
+    printed = capfd.readouterr().out
+    assert "sigma x" in printed
+    assert "covariances are rotation_first, local (stated)" in printed
+    assert json.loads((out / "metrics.json").read_text())["estimators"]["drive"]["nees"]
+    assert "Are the covariances credible?" in (out / "report.html").read_text()
+    assert main(monkeypatch, *arguments) == 2
+    assert "add --overwrite" in capfd.readouterr().err
+    assert main(monkeypatch, *arguments, "--overwrite") == 0
