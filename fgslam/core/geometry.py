@@ -236,9 +236,9 @@ def is_rigid(matrix: FloatArray) -> bool:
 
 
 def change_tangent_frame(aTb: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a motion expressed in b, expressed in a: ``Ad(aTb) C Ad(aTb)^T``."""
+    """Covariance (..., 6, 6) of a motion in b, expressed in a: ``Ad(aTb) C Ad(aTb)^T``."""
     ad = adjoint(aTb)
-    return np.asarray(ad @ covariance @ ad.T)
+    return np.asarray(ad @ covariance @ np.swapaxes(ad, -1, -2))
 
 
 def body_to_camera_motion(bTb: FloatArray, bTc: FloatArray) -> FloatArray:

@@ -29,23 +29,19 @@ from fgslam.datasets.times import (
     time_unit,
 )
 
-TANGENT_WORDS = {
-    "order": ("rotation_first", "translation_first"),
-    "space": ("local", "global", "split_local", "split_global"),
-    "unit": ("radians", "degrees"),
-}
-"""What a comment, a header or the user may state of covariances
-(:mod:`fgslam.evaluation.credibility`)."""
+TANGENT_WORDS = (
+    *("rotation_first", "translation_first", "local", "global", "split_local", "split_global"),
+    *("radians", "degrees"),
+)
+"""What comments, headers and users state of covariances (:mod:`fgslam.evaluation.credibility`)."""
 
 _HEADERS = {
     r"tangent \[rotation, translation\]": ("rotation_first", "local", "radians"),  # ours
     r"\bpr11\b": ("rotation_first", "split_local", "radians"),  # OpenVINS
     r"\b[pt]xx\b": ("translation_first", "radians"),  # cnspy, and its types of error
-    r"\btype1\b": ("local",),
-    r"\btype2\b": ("global",),
-    r"\btype5\b": ("split_local",),
-    r"\btype6\b": ("split_global",),
-} | {rf"\b{word}\b": (word,) for words in TANGENT_WORDS.values() for word in words}
+    **{rf"\btype{k}\b": (TANGENT_WORDS[1 + k if k < 3 else k - 1],) for k in (1, 2, 5, 6)},
+    **{rf"\b{word}\b": (word,) for word in TANGENT_WORDS},
+}
 
 _POSE = 8
 _SIZES = (12, 21, 36)
@@ -194,17 +190,19 @@ def _checked(matrices: FloatArray, path: Path, places: IntArray, place: str) -> 
             "give them by --covariance FILE"
         )
     even = 0.5 * (found + np.swapaxes(found, 1, 2))
-    skewed = np.abs(found - even).max(axis=(1, 2)) > 1e-3 * scale
-    negative = (np.diagonal(found, axis1=1, axis2=2) < 0.0).any(axis=1)
-    indefinite = np.linalg.eigvalsh(correlation(even))[:, 0] < _INDEFINITE
-    faults = {"is not symmetric": skewed, "has a negative variance": negative,
-              "is not positive definite": indefinite}  # fmt: skip
-    for what, bad in faults.items():
+    lowest = np.minimum(
+        np.linalg.eigvalsh(correlation(even))[:, 0],
+        np.diagonal(found, axis1=1, axis2=2).min(axis=1) / np.maximum(scale, 1e-300),
+    )
+    for what, bad in (
+        ("symmetric", np.abs(found - even).max(axis=(1, 2)) > 1e-3 * scale),
+        ("positive definite", lowest < _INDEFINITE),
+    ):
         if np.any(bad):
             raise DatasetError(
-                f"{path}, {place} {places[int(np.argmax(bad))]}: the covariance {what}, "
-                f"{int(np.sum(bad))} of {len(found)} are so; correct what wrote it, or write nan "
-                "in place of its numbers to leave it out"
+                f"{path}, {place} {places[int(np.argmax(bad))]}: the covariance is not {what}, nor "
+                f"are {int(np.sum(bad)) - 1} others; correct what wrote it, or write nan in place "
+                "of its numbers to leave it out"
             )
     return np.where(known[:, None, None], even, np.nan)
 

@@ -16,7 +16,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.files import as_path, make_subfolder
-from fgslam.core.geometry import adjoint, change_tangent_frame, inverse, pose
+from fgslam.core.geometry import change_tangent_frame, inverse, pose
 from fgslam.core.log import MeasurementLog
 from fgslam.core.types import LAGS, Estimate, Trajectory
 from fgslam.datasets.stated import TANGENT_WORDS, StatedPoses, read_stated
@@ -28,25 +28,14 @@ from fgslam.evaluation.credibility import (
     turned_axes,
 )
 from fgslam.evaluation.judging import Truth, judge_answer, lone_answer
-from fgslam.evaluation.statistics import (
-    SAME_TIME_S,
-    JsonValue,
-    associate,
-    to_estimate_world,
-    value_at,
-)
+from fgslam.evaluation.statistics import SAME_TIME_S, associate, to_estimate_world, value_at
 from fgslam.evaluation.truth import sound_truth
-from fgslam.report.content import Column, TextTable, read_metrics, write_json
-from fgslam.report.results import (
-    NO_LANDMARKS,
-    ReportData,
-    judged_report,
-    truth_in_their_world,
-)
+from fgslam.report.content import TextTable, read_metrics, write_json
+from fgslam.report.results import NO_LANDMARKS, ReportData, judged_report
 from fgslam.runs.config import load_config
 from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE, RUN_MARKER, is_run_folder
-from fgslam.runs.results import number_text
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE
+from fgslam.runs.tables import JUDGED_COLUMNS, judged_tables
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.slam.replay import replay
 
@@ -57,7 +46,8 @@ if TYPE_CHECKING:
 Given: TypeAlias = str | Path | tuple[Trajectory, FloatArray]
 """A file, ``BAG:/topic``, a run folder or an estimator's in it; or poses and covariances."""
 
-_OWN = frozenset({"rotation_first", "local", "radians"})
+GUESSED = " (guess)"
+"""Mark of an estimate whose tangent space nothing states."""
 _FINAL = "final.tum"
 _JOINT = "motions are judged by the joint covariances of the run"
 _ACCUMULATED = (
@@ -69,28 +59,6 @@ _HALVES = (
     "the sum of their covariances; what both share cancels, as errors of odometry and calibration, "
     "so that more than 1 shows overconfidence and less than 1 shows nothing"
 )
-
-
-COLUMNS = (
-    ("poses", "NEES|pose", ("nees.pose.per_dof",), ".2f", "squared errors over stated variances, "
-     "per degree of freedom: 1 is right, more is overconfident; the first pose is aligned"),
-    ("poses", "95 % band of a|consistent one", ("nees.pose.lower", "nees.pose.upper"), ".2f",
-     "for as many errors as are independent, by their autocorrelation"),
-    ("poses", "verdict", ("nees.pose.verdict",), "", "by that band"),
-    ("poses", "NEES rotation|position", ("nees.rotation.per_dof", "nees.position.per_dof"), ".2f",
-     "the same of both alone"),
-    ("poses", "mend:|sigma x", ("sigma_factor.pose",), ".2f", "root of the NEES: what stated "
-     "deviations are to be multiplied by"),
-    ("errors", "ATE m", ("ate_rmse_m",), ".3f", "root mean square position error, SE3 aligned"),
-    ("errors", "NEES best|aligned", ("nees_best.per_dof",), ".2f", "of the poses, aligned where it "
-     "is least"),
-    ("errors", "NEES motions|1 5 20 frames", tuple(
-        f"nees_relative.{lag}.per_dof" for lag in LAGS), ".2f",
-     "of the motions over so many frames"),
-    ("errors", "within 1 2 3|sigma, %", ("within_sigma.1", "within_sigma.2", "within_sigma.3"),
-     "%", "shares of errors; right are 68, 95 and 99.7 %"),
-)  # fmt: skip
-"""Table, heading, places in metrics.json, format and meaning of what is shown."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,67 +82,21 @@ class JudgedEstimates:
         return f"<judged: {', '.join(self.values)}>"
 
     def table(self) -> pd.DataFrame:
-        """A row for each estimate: ate_rmse_m, nees_pose_per_dof, ...; NaN where not known."""
+        """A row for each estimate: `ate_m`, `nees_pose`, `sigma_factor`, ...; NaN: not known."""
         import pandas as pd  # half a second, and only tables need it
 
-        paths = [path for _, _, group, *_ in COLUMNS for path in group]
-        rows = [[value_at(v, path) for path in paths] for v in self.values.values()]
-        names = [path.replace(".", "_") for path in paths]
-        return pd.DataFrame(rows, index=list(self.values), columns=names)
+        rows = [[value_at(v, path) for _, path in JUDGED_COLUMNS] for v in self.values.values()]
+        return pd.DataFrame(rows, list(self.values), [name for name, _ in JUDGED_COLUMNS])
 
     def text_tables(self) -> tuple[TextTable, ...]:
-        """The same to be read; a name with a guessed tangent space has a mark."""
-        found = []
-        for key, heading in _HEADINGS.items():
-            shown = [column for column in COLUMNS if column[0] == key]
-            rows = tuple(
-                (
-                    name + GUESSED * bool(values["tangent_guessed"]),
-                    tuple(_cell(values, paths, form) for _, _, paths, form, _ in shown),
-                )
-                for name, values in self.values.items()
-            )
-            columns = tuple(Column(head.replace("|", "\n"), text) for _, head, *_, text in shown)
-            found.append(TextTable(key, heading, "estimate", columns, rows))
-        return tuple(found)
-
-    def report(self) -> ReportData:
-        """The page: errors next to three stated deviations, along axes and over time, and NEES."""
-        known = next(iter(self.truth.values()))
-        found = tuple(
-            replace(
-                judged_report(name, name, one, None, self.truth[name]),
-                verdict=value_at(self.values[name], "nees.pose.verdict"),
-                nees_per_dof=value_at(self.values[name], "nees.pose.per_dof"),
-            )
-            for name, one in self.estimates.items()
-        )
-        return ReportData(
-            title="Are the covariances credible?",
-            subtitle=", ".join(self.values),
-            estimators=found,
-            truth=truth_in_their_world(found, known),
-            notes=self.notes,
-            tables=self.text_tables(),
-        )
+        """The same to be read; a name whose tangent space was guessed has a mark."""
+        return judged_tables({name + GUESSED * v["guessed"]: v for name, v in self.values.items()})
 
     def plot(self) -> go.Figure:
         """Paths with their ellipses, errors next to three stated deviations, NEES over time."""
         from fgslam.report.figures import plot  # loads Plotly
 
         return plot(self.estimates, next(iter(self.truth.values())))
-
-
-GUESSED = " (guess)"
-"""Mark of an estimate whose tangent space no file states."""
-_HEADINGS = {"poses": "stated covariances against errors", "errors": "errors, motions, coverage"}
-
-
-def _cell(values: Mapping[str, Any], paths: Sequence[str], form: str) -> str:
-    found = [value_at(values, path) for path in paths]
-    if form == "%":
-        return " ".join(number_text(None if v is None else 100.0 * v, ".0f") for v in found)
-    return " ".join(number_text(value, form) for value in found)
 
 
 def judge(
@@ -219,52 +141,20 @@ def judge(
     values, estimated, truths = {}, {}, {}
     for name, one in named.items():
         stated, run = _opened(one, None if covariance is None else Path(covariance))
-        about: dict[str, JsonValue] = {"tangent_guessed": False}
+        space, about = Tangent(), {"guessed": False, "tangent": str(Tangent())}
         if true is None:
-            space, turned = Tangent(), np.eye(4)
-            estimate, by = _halves(name, stated.trajectory, run)
-            covariances = estimate.covariances
+            estimate, by = _halves(name, run)
             notes.append(_HALVES)
         else:
             by = _of_same_frame(name, stated, true, run)
-            covariances = _covariances(name, stated)
-            _require_same_times(name, stated.trajectory, by)
-            axes = turned_axes(stated.trajectory, by)
-            turned = pose(axes, np.zeros(3))
-            if not np.array_equal(axes, np.eye(3)):
-                by = replace(by, poses=by.poses @ turned)
-                notes.append(f"{name}: x, y, z are {_axes_words(axes)} of the truth (guess)")
-            found = guess_tangent(
-                stated.trajectory, covariances, by, stated.words | words, stated.usual
-            )
-            space = found.tangent
-            notes += [f"{name}: covariances are {space} ({found.how})", *stated.notes]
-            advice = f"--tangent {str(found.fitting or space).replace(', ', ',')}"
-            if space.unit == "degrees" and "degrees" not in stated.words | words:
-                raise DatasetError(
-                    f"{name}: its rotations fit as degrees, not as radians; write radians, or "
-                    f"state what they are: {advice} (or ...,radians)"
-                )
-            if found.fitting is not None and not found.guessed:
-                notes.append(f"{name}: {found.fitting} fits the errors far better; if so, {advice}")
-            about = {"tangent_guessed": found.guessed}
-            local = space.to_local(stated.trajectory.poses, covariances)
-            relative = accumulated(stated.trajectory.poses, local)
-            estimate = Estimate(stated.trajectory, local, NO_LANDMARKS, relative=relative)
-            own = (
-                run is not None
-                and truth is not None
-                and not isinstance(truth, Trajectory)
-                and (Path(truth).resolve() == (run[0] / GROUND_TRUTH_FILE).resolve())
-            )
-            joint = _joint(*run) if own and run else None
+            space, estimate, found = _in_world_of(name, stated, words, by)
+            notes += [*stated.notes, *found]
+            about = {"tangent": str(space), "guessed": any("(guess: " in note for note in found)}
+            joint = _joint(run, truth)
             about |= {"nees_relative": joint} if joint else {}
             notes.append(_JOINT if joint else _ACCUMULATED)
-        values[name] = _numbers(name, space, estimate, covariances, by) | {
-            "tangent": str(space),
-            **about,
-        }
-        estimated[name], truths[name] = _as_drawn(estimate, by, turned)
+        values[name] = _numbers(estimate, by, space.split) | about
+        estimated[name], truths[name] = estimate, by
     return JudgedEstimates(values, tuple(dict.fromkeys(notes)), estimated, truths)
 
 
@@ -274,7 +164,23 @@ def write_judged(found: JudgedEstimates, folder: Path) -> Path:
 
     make_subfolder(folder.parent, folder.name)
     write_json(folder / METRICS_FILE, {"notes": found.notes, "estimators": dict(found.values)})
-    write_report(folder / REPORT_FILE, found.report())
+    reports = tuple(
+        replace(
+            judged_report(name, name, one, None, found.truth[name]),
+            verdict=value_at(found.values[name], "nees.pose.verdict"),
+            nees_per_dof=value_at(found.values[name], "nees.pose.per_dof"),
+        )
+        for name, one in found.estimates.items()
+    )
+    data = ReportData(
+        title="Are the covariances credible?",
+        subtitle=", ".join(found.values),
+        estimators=reports,
+        truth=next(iter(found.truth.values())),
+        notes=found.notes,
+        tables=found.text_tables(),
+    )
+    write_report(folder / REPORT_FILE, data)
     return folder / REPORT_FILE
 
 
@@ -288,32 +194,27 @@ def _named(given: Any) -> dict[str, Given]:
     if isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Trajectory):
         return {"estimate": given}
     many = [given] if isinstance(given, str | Path) else list(given)
-    paths = [str(as_path(one, DatasetError, "estimate")) for one in many]
-    short = [
-        Path(path).parent.name if path.endswith("/final.tum") else Path(path).stem for path in paths
-    ]
-    return dict(zip(short if len(set(short)) == len(short) else paths, paths, strict=True))
+    paths = [as_path(one, DatasetError, "estimate") for one in many]
+    short = [path.parent.name if path.name == _FINAL else path.stem for path in paths]
+    names = short if len(set(short)) == len(short) else map(str, paths)
+    return dict(zip(names, map(str, paths), strict=True))
 
 
 def _tangent_words(text: str) -> frozenset[str]:
     words = [word for part in text.split(",") if (word := part.strip())]
-    known = [word for group in TANGENT_WORDS.values() for word in group]
     for word in words:
-        if word not in known:
-            raise ConfigError(f"--tangent: no word {word!r}; use {', '.join(known)}, with commas")
+        if word not in TANGENT_WORDS:
+            raise ConfigError(f"--tangent: no word {word!r}; use {', '.join(TANGENT_WORDS)}")
     return frozenset(words)
 
 
 def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Path, str] | None]:
     """What an estimate states, and of one of our runs its folder and the estimator's title."""
     if isinstance(one, tuple):
-        trajectory, matrices = one
-        if np.shape(matrices) != (len(trajectory), 6, 6):
-            raise ConfigError(
-                f"covariances of shape {np.shape(matrices)} for {len(trajectory)} poses; give "
-                f"({len(trajectory)}, 6, 6)"
-            )
-        return StatedPoses(trajectory, np.asarray(matrices, np.float64), _OWN), None
+        shape = (len(one[0]), 6, 6)
+        if np.shape(one[1]) != shape:
+            raise ConfigError(f"covariances of shape {np.shape(one[1])}; give {shape}, one a pose")
+        return StatedPoses(*one, frozenset(("rotation_first", "local", "radians"))), None
     path = Path(one)
     if is_run_folder(path):
         path = path / load_config(path / RUN_MARKER).estimator.title
@@ -321,140 +222,139 @@ def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Pat
     beside = path.with_name("covariance.csv")
     if path.name == _FINAL and covariance is None and beside.is_file():
         covariance = beside
-    folder = path.parent
-    run = (folder.parent, folder.name) if is_run_folder(folder.parent) else None
-    return read_stated(path, covariance), run
-
-
-def _covariances(name: str, stated: StatedPoses) -> FloatArray:
-    if stated.covariances is None:
-        raise DatasetError(
-            f"{name}: states no covariances; give them by --covariance FILE, a row a pose: 21 "
-            "numbers (upper triangle of a 6x6) or 36, with the time before them"
-        )
-    return stated.covariances
+    run = path.parent.parent
+    return read_stated(path, covariance), (run, path.parent.name) if is_run_folder(run) else None
 
 
 def _of_same_frame(
     name: str, stated: StatedPoses, truth: StatedPoses, run: tuple[Path, str] | None
 ) -> Trajectory:
-    """The truth as poses of what the estimate is of."""
-    frame = stated.trajectory.frame
-    if not (truth.frame_stated and stated.frame_stated) or truth.trajectory.frame == frame:
-        return replace(truth.trajectory, frame=frame)
-    if run is None:
-        raise DatasetError(
-            f"{name}: {stated.trajectory.named}, and the truth {truth.trajectory.named}; give both "
-            "of one frame: fgslam export RUN --trajectory FILE --frame left|right|body"
-        )
-    return truth.trajectory.of(frame, MeasurementLog.load(run[0] / LOG_FILE).rig)
-
-
-def _axes_words(axes: FloatArray) -> str:
-    rows = np.abs(axes).argmax(axis=0)
-    return ", ".join("-" * int(axes[row, k] < 0.0) + "xyz"[row] for k, row in enumerate(rows))
-
-
-def _require_same_times(name: str, estimate: Trajectory, truth: Trajectory) -> None:
-    """Raises DatasetError unless three poses have a truth."""
-    rows, _ = associate(estimate.timestamps, truth.timestamps)
+    """The truth as poses of what the estimate is of. Raises DatasetError: other times or frames."""
+    path, frame = stated.trajectory, stated.trajectory.frame
+    known = truth.trajectory
+    rows, _ = associate(path.timestamps, known.timestamps)
     if len(rows) < 3:
-        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" if len(t) else "empty"
-                 for t in (estimate.timestamps, truth.timestamps)]  # fmt: skip
+        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (path.timestamps, known.timestamps)]
         raise DatasetError(
             f"{name}: from {spans[0]}, the truth from {spans[1]}: {len(rows)} poses have a true "
             f"one within {SAME_TIME_S:g} s; give both the times of one clock"
         )
+    if not (truth.frame_stated and stated.frame_stated) or known.frame == frame:
+        return replace(known, frame=frame)
+    if run is None:
+        raise DatasetError(
+            f"{name}: {path.named}, and the truth {known.named}; give both of one frame: fgslam "
+            "export RUN --trajectory FILE --frame left|right|body"
+        )
+    return known.of(frame, MeasurementLog.load(run[0] / LOG_FILE).rig)
 
 
-def _joint(run: Path, title: str) -> JsonValue:
-    """NEES of motions by joint covariances, as the run judged them; None where it did not."""
-    path = run / METRICS_FILE
-    found = read_metrics(path) if path.is_file() else {}
-    return value_at(found, f"estimators.{title}.nees_relative") or None
+def _in_world_of(
+    name: str, stated: StatedPoses, words: frozenset[str], truth: Trajectory
+) -> tuple[Tangent, Estimate, list[str]]:
+    """Its tangent space; the estimate with the truth's world and axes, and what was noted."""
+    path, covariances = stated.trajectory, stated.covariances
+    if covariances is None:
+        raise DatasetError(
+            f"{name}: states no covariances; give them by --covariance FILE, a row a pose: 21 "
+            "numbers (upper triangle of a 6x6) or 36, with the time before them"
+        )
+    axes, notes = turned_axes(path, truth), []
+    turned = pose(axes, np.zeros(3))
+    if not np.array_equal(axes, np.eye(3)):
+        way = ", ".join("-" * int(one.min() < 0.0) + "xyz"[abs(one).argmax()] for one in axes.T)
+        notes.append(f"{name}: x, y, z are {way} of the truth (guess)")
+    known = words | stated.words
+    seen = replace(truth, poses=truth.poses @ turned)
+    space, why, fitting = guess_tangent(path, covariances, seen, known, stated.usual)
+    if space.unit == "degrees" and "degrees" not in known:
+        raise DatasetError(
+            f"{name}: its rotations fit as degrees, not as radians; write radians, or state what "
+            f"they are: --tangent {space} (or ...,radians)"
+        )
+    notes.append(f"{name}: covariances are {space} ({why or 'stated'})")
+    if fitting is not None and not why:
+        notes.append(f"{name}: {fitting} fits the errors far better; if so, --tangent {fitting}")
+    rows, of = associate(path.timestamps, truth.timestamps)
+    poses = truth.poses[of[0]] @ turned @ inverse(path.poses[rows[0]]) @ path.poses @ turned.T
+    local = change_tangent_frame(turned, space.to_local(path.poses, covariances))
+    relative = {lag: accumulated(poses, local, lag) for lag in LAGS if lag < len(poses)}
+    return (
+        space,
+        Estimate(replace(path, poses=poses), local, NO_LANDMARKS, relative=relative),
+        notes,
+    )
+
+
+def _joint(run: tuple[Path, str] | None, truth: Any) -> Any:
+    """NEES of motions by joint covariances, as the run judged them by this truth; else None."""
+    if run is None or isinstance(truth, Trajectory) or Path(truth) != run[0] / GROUND_TRUTH_FILE:
+        return None
+    return value_at(read_metrics(run[0] / METRICS_FILE), f"estimators.{run[1]}.nees_relative")
 
 
 # --------------------------------------------------------------------------------------------
 # Numbers
 
 
-def _numbers(
-    name: str, space: Tangent, estimate: Estimate, stated: FloatArray, truth: Trajectory
-) -> dict[str, Any]:
-    path = estimate.trajectory
-    sound = sound_truth(path, truth).trajectory
-    found = None if sound is None else to_estimate_world(path, sound)
-    if found is None:
-        raise DatasetError(f"{name}: no pose has a true one; give the truth of its times")
-    rows, true = found[0][1:], found[1][1:]  # the first is aligned
-    judged = credibility(space, path.poses[rows], stated[rows], true)
+def _numbers(estimate: Estimate, truth: Trajectory, split: bool) -> dict[str, Any]:
+    path, sound = estimate.trajectory, sound_truth(estimate.trajectory, truth).trajectory
+    rows, true = to_estimate_world(path, sound or truth) or (np.empty(0, int), np.empty((0, 4, 4)))
+    later = rows[1:]  # the first is aligned
+    judged = credibility(path.poses[later], estimate.covariances[later], true[1:], split)
     metrics = judge_answer(lone_answer(estimate), Truth(truth)).metrics.as_json()
     return metrics | asdict(judged)
 
 
-def _as_drawn(
-    estimate: Estimate, truth: Trajectory, turned: FloatArray
-) -> tuple[Estimate, Trajectory]:
-    """Both as poses of what the truth is of, in its world, the first pose aligned: to be drawn."""
-    path, back = estimate.trajectory, inverse(turned)
-    rows, of = associate(path.timestamps, truth.timestamps)
-    world = truth.poses[of[0]] @ inverse(path.poses[rows[0]])
-    moved = replace(path, poses=world @ path.poses @ back)
-    covariances = change_tangent_frame(turned, estimate.covariances)
-    known = replace(truth, poses=truth.poses @ back)
-    return replace(estimate, trajectory=moved, covariances=covariances), known
-
-
-def _halves(
-    name: str, path: Trajectory, run: tuple[Path, str] | None
-) -> tuple[Estimate, Trajectory]:
+def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajectory]:
     """One half's poses with the covariances of their difference, and the other half's as truth."""
     if run is None:
         raise ConfigError(
             f"{name}: is no run of fgslam, which could be judged by itself; give --truth FILE"
         )
-    folder, title = run
-    config = load_config(folder / RUN_MARKER)
-    settings = next((one for one in config.estimators if one.title == title), None)
-    if settings is None:
-        raise DatasetError(f"{folder}: its configuration has no {title}; give --truth FILE")
-    log = MeasurementLog.load(folder / LOG_FILE)
-    arrival, halves = arrival_of(folder), []
+    config, log = load_config(run[0] / RUN_MARKER), MeasurementLog.load(run[0] / LOG_FILE)
+    settings = next((one for one in config.estimators if one.title == run[1]), config.estimator)
+    halves = []
     for half in (0, 1):
-        found = replay(half_of(log, half), settings, config.frontend.ego_motion, arrival=arrival)
+        found = replay(
+            half_of(log, half), settings, config.frontend.ego_motion, arrival=arrival_of(run[0])
+        )
         if found.failure:
-            raise DatasetError(f"{name}: half of its landmarks do not do: {found.failure}; give "
-                               "--truth FILE")  # fmt: skip
+            raise DatasetError(
+                f"{name}: half of its landmarks do not do: {found.failure}; give --truth FILE"
+            )
         halves.append(found.estimate)
     first, second = halves
-    carry = adjoint(inverse(first.trajectory.poses) @ second.trajectory.poses)
-    both = first.covariances + carry @ second.covariances @ np.swapaxes(carry, 1, 2)
-    relative = {lag: one + second.relative[lag] for lag, one in first.relative.items()
-                if lag in second.relative}  # fmt: skip
+    both = first.covariances + change_tangent_frame(
+        inverse(first.trajectory.poses) @ second.trajectory.poses, second.covariances
+    )
+    relative = {lag: one + second.relative[lag] for lag, one in first.relative.items()}
     return Estimate(first.trajectory, both, NO_LANDMARKS, relative=relative), second.trajectory
 
 
 def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
     """The log with every second landmark alone; those that a loop merges stay together."""
-    same = {int(a): int(b) for one in log for loop in one.loops for a, b in loop.merged}
+    root: dict[int, int] = {}
+    for one in log:
+        for loop in one.loops:
+            root |= {a: root.get(b, b) for a, b in loop.merged.tolist()}
 
     def kept(ids: IntArray) -> BoolArray:
-        roots = ids.tolist()
-        for _ in same:
-            following = [same.get(root, root) for root in roots]
-            if following == roots:
-                break
-            roots = following
-        return np.array([root % 2 == half for root in roots], np.bool_)
+        return np.array([root.get(i, i) % 2 == half for i in ids.tolist()], np.bool_)
 
     out = MeasurementLog(log.rig, log.motion_model)
     for one in log:
-        loops = tuple(
-            replace(loop, observations=loop.observations.select(kept(loop.observations.ids)),
-                    merged=loop.merged[kept(loop.merged[:, 0])]) for loop in one.loops)  # fmt: skip
         mine = kept(one.observations.ids)
-        out.append(replace(
-            one, observations=one.observations.select(mine), rejected=one.rejected[mine],
-            missed_ids=one.missed_ids[kept(one.missed_ids)],
-            pruned_ids=one.pruned_ids[kept(one.pruned_ids)], loops=loops))  # fmt: skip
+        loops = tuple(
+            replace(
+                loop,
+                observations=loop.observations.select(kept(loop.observations.ids)),
+                merged=loop.merged[kept(loop.merged[:, 0])],
+            )
+            for loop in one.loops
+        )
+        half_seen = one.observations.select(mine), one.rejected[mine]
+        missed, pruned = (ids[kept(ids)] for ids in (one.missed_ids, one.pruned_ids))
+        out.append(replace(one, observations=half_seen[0], rejected=half_seen[1],
+                           missed_ids=missed, pruned_ids=pruned, loops=loops))  # fmt: skip
     return out

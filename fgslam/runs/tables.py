@@ -20,7 +20,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import PoseFrame
-from fgslam.core.types import Estimate, LandmarkMap, Trajectory, write_covariances
+from fgslam.core.types import LAGS, Estimate, LandmarkMap, Trajectory, write_covariances
 from fgslam.evaluation.statistics import value_at
 from fgslam.report.content import Column, TextTable, write_csv
 from fgslam.report.formats import MapPoints, write_ply
@@ -149,7 +149,7 @@ class Metric(NamedTuple):
     Attributes:
         name: of its column in files; those of ``RESULT`` and ``TIME`` stand in comparison.csv.
         path: dotted, in metrics.json.
-        group: ``RESULT``, ``TIME`` or ``FURTHER``.
+        group: ``RESULT``, ``TIME``, ``FURTHER`` or ``JUDGED``.
         column: table and heading that it is shown under, alone or after others; | ends a line.
         text: its format there.
         absent: key of the reason why it may be absent.
@@ -165,7 +165,7 @@ class Metric(NamedTuple):
     meaning: str = ""
 
 
-RESULT, TIME, FURTHER = "result", "time", "further"
+RESULT, TIME, FURTHER, JUDGED = "result", "time", "further", "judged"
 _METRICS = tuple(Metric(*row) for row in (
     ("kind", "kind", RESULT),
     ("odometry", "odometry", RESULT),
@@ -255,6 +255,25 @@ _METRICS = tuple(Metric(*row) for row in (
     ("peak_memory_mib", "peak_memory_mb", TIME, "cost: memory|MiB", ",.0f", "system",
      "largest resident memory of the process"),
     ("memory_before_mib", "memory_before_mb", TIME),
+    ("nees_pose", "nees.pose.per_dof", JUDGED, "judged: NEES|pose", "ratio", "truth", "squared "
+     "errors over stated variances per degree of freedom: 1 is right, more is overconfident"),
+    ("band_lower", "nees.pose.lower", JUDGED, "judged: 95 % band of a|consistent one", "ratio",
+     "truth", "for as many errors as are independent, by their autocorrelation"),
+    ("band_upper", "nees.pose.upper", JUDGED, "judged: 95 % band of a|consistent one", "ratio"),
+    ("verdict", "nees.pose.verdict", JUDGED, "judged: verdict", "text", "truth", "by that band"),
+    ("nees_rotation", "nees.rotation.per_dof", JUDGED, "judged: NEES rotation|position", "ratio",
+     "truth", "the same of both alone"),
+    ("nees_position", "nees.position.per_dof", JUDGED, "judged: NEES rotation|position", "ratio"),
+    ("sigma_factor", "sigma_factor.pose", JUDGED, "judged: mend:|sigma x", "ratio", "truth",
+     "what stated deviations are to be multiplied by"),
+    ("ate_m", "ate_rmse_m", JUDGED, "errors: ATE m", ".3f", "truth", "rms position error, SE3 "
+     "aligned"),
+    ("nees_best", "nees_best.per_dof", JUDGED, "errors: NEES best|aligned", "ratio", "truth",
+     "of the poses, aligned where it is least"),
+    *((f"nees_motion_{lag}", f"nees_relative.{lag}.per_dof", JUDGED, "errors: NEES motions|"
+       "1 5 20 frames", "ratio", "joint", "of motions over so many frames") for lag in LAGS),
+    *((f"within_{k}_sigma", f"within_sigma.{k}", JUDGED, "errors: within|1 2 3 sigma", ".0%",
+       "truth", "shares of errors; right are 68, 95 and 99.7 %") for k in (1, 2, 3)),
     ("trials_ate_final", "intervals.ate_rmse_m", FURTHER, "trials: ATE final cm", "cm3", "truth"),
     ("trials_ate_online", "intervals_online.ate_rmse_m", FURTHER, "trials: ATE online cm", "cm3",
      "truth"),
@@ -268,6 +287,8 @@ RESULT_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == RESULT)
 """What the same measurements give to the byte: column, and where its value is in the metrics."""
 TIME_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == TIME)
 """What differs from one execution to the next."""
+JUDGED_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == JUDGED)
+"""Of estimates of any program, held against their covariances."""
 _TABLES = ("accuracy", "consistency", "cost")
 _ABSENT = {
     "truth": "no ground truth, or fewer than three poses matched",
@@ -371,6 +392,12 @@ def comparison_tables(name: str, frames: int, values: Mapping[str, Any]) -> tupl
 def trials_table(heading: str, values: Mapping[str, Any]) -> TextTable:
     """Means over trials with their intervals, by estimator."""
     return _table(heading, "trials", marked(values))
+
+
+def judged_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:
+    """Estimates of any program by name: stated covariances against errors, motions, coverage."""
+    headings = {"judged": "stated covariances against errors", "errors": "errors and coverage"}
+    return tuple(_table(heading, key, values) for key, heading in headings.items())
 
 
 def page_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:

@@ -84,8 +84,8 @@ def test_rotation_and_position_are_openvins_and_the_pose_is_cnspy_s_type_5() -> 
     wide = path.poses @ np.array([g.se3_exp(0.05 * rng.normal(size=6)) for _ in range(40)])
     stated = as_stated(Tangent(space="split_local"), wide, local + 1e-3 * np.eye(6))
     stated[:, :3, 3:] = stated[:, 3:, :3] = 0.0
-    tangent = Tangent("rotation_first", "split_local")
-    found = credibility(tangent, wide, stated, truth.poses).nees
+    own = Tangent(space="split_local").to_local(wide, stated)
+    found = credibility(wide, own, truth.poses, split=True).nees
     ours, theirs = pose_rows(wide), pose_rows(truth.poses)
     each = np.array([openvins(a, b, c[:3, :3], c[3:, 3:])
                      for a, b, c in zip(ours, theirs, stated, strict=True)])  # fmt: skip
@@ -112,7 +112,7 @@ def test_the_pose_in_a_local_tangent_space_is_cnspy_s_type_1_on_se3() -> None:
         off = np.real(logm(np.linalg.inv(wTe) @ wTt))
         xi = np.array([off[2, 1], off[0, 2], off[1, 0], *off[:3, 3]])
         expected.append(xi @ np.linalg.inv(covariance) @ xi / 6.0)
-    found = credibility(Tangent(), path.poses, stated, truth.poses).nees["pose"]
+    found = credibility(path.poses, stated, truth.poses, split=False).nees["pose"]
     assert found is not None
     assert found.per_dof == pytest.approx(np.mean(expected), abs=1e-6)
 
@@ -126,8 +126,8 @@ def test_the_tangent_space_is_told_from_the_errors(order: str, space: str) -> No
         path, local, truth = dead_reckoning(seed)
         stated = as_stated(written, path.poses, local)
         found = guess_tangent(path, stated, truth, frozenset(), "")
-        assert found.guessed
-        assert found.tangent == written
+        assert "guess" in found[1]
+        assert found[0] == written
         np.testing.assert_allclose(written.to_local(path.poses, stated), local, atol=1e-12)
 
 
@@ -144,8 +144,8 @@ def test_errors_alone_tell_the_order_and_what_they_leave_open(order: str, space:
     written = Tangent(order, space)
     stated = as_stated(written, poses, local)
     found = guess_tangent(Trajectory(path.timestamps, poses), stated, truth, frozenset(), "")
-    assert found.tangent.order == order
-    assert found.tangent == written or str(written) in found.how
+    assert found[0].order == order
+    assert found[0] == written or str(written) in found[1]
 
 
 def test_degrees_are_told_from_radians() -> None:
@@ -154,18 +154,18 @@ def test_degrees_are_told_from_radians() -> None:
         written = Tangent(unit=unit)
         stated = as_stated(written, path.poses, local)
         words = frozenset({"rotation_first", "local"})
-        assert guess_tangent(path, stated, truth, words, "").tangent == written
+        assert guess_tangent(path, stated, truth, words, "")[0] == written
 
 
 def test_a_statement_holds_and_is_contradicted_where_the_errors_do_so() -> None:
     path, local, truth = dead_reckoning(0)
     words = frozenset({"translation_first", "local", "radians"})
     found = guess_tangent(path, local, truth, words, "")
-    assert (found.tangent.order, found.guessed) == ("translation_first", False)
-    assert found.fitting is not None
-    assert found.fitting.order == "rotation_first"
+    assert (found[0].order, found[1]) == ("translation_first", "")
+    assert found[2] is not None
+    assert found[2].order == "rotation_first"
     right = guess_tangent(path, local, truth, frozenset({"rotation_first", "local"}), "")
-    assert right.fitting is None
+    assert right[2] is None
 
 
 def test_the_usual_space_is_left_only_where_the_errors_demand_it() -> None:
@@ -173,8 +173,8 @@ def test_the_usual_space_is_left_only_where_the_errors_demand_it() -> None:
     path, _, truth = dead_reckoning(0)
     round_ones = np.tile(np.diag(np.repeat([0.04, 0.0004], 3)), (len(path), 1, 1))
     found = guess_tangent(path, round_ones, truth, frozenset({"translation_first"}), "split_global")
-    assert found.tangent == Tangent("translation_first", "split_global")
-    assert "not surely" in found.how
+    assert found[0] == Tangent("translation_first", "split_global")
+    assert "not surely" in found[1]
 
 
 @pytest.mark.parametrize("factor", [0.25, 1.0, 4.0])
@@ -185,7 +185,7 @@ def test_the_factor_mends_stated_deviations(factor: float) -> None:
     errors = rng.multivariate_normal(np.zeros(6), covariance, 2000)
     poses = np.array([g.inverse(g.se3_exp(e)) for e in errors])
     stated = np.tile(factor**2 * covariance, (2000, 1, 1))
-    found = credibility(Tangent(), poses, stated, truth)
+    found = credibility(poses, stated, truth, split=False)
     mend = found.sigma_factor["pose"]
     assert mend == pytest.approx(1.0 / factor, rel=0.03)
     consistency = found.nees["pose"]
@@ -217,15 +217,16 @@ def test_what_does_not_vary_is_counted_as_it_is() -> None:
 
 def test_motions_of_dead_reckoning_have_the_noise_of_their_steps() -> None:
     path, local, _ = dead_reckoning(3)
-    found = accumulated(path.poses, local)
-    np.testing.assert_allclose(found[1], np.tile(NOISE, (len(path) - 1, 1, 1)), atol=1e-12)
-    assert sorted(found) == [1, 5, 20]
+    found = accumulated(path.poses, local, 1)
+    np.testing.assert_allclose(found, np.tile(NOISE, (len(path) - 1, 1, 1)), atol=1e-12)
+    five = accumulated(path.poses, local, 5)
+    assert np.isfinite(five).all()
 
 
 def test_a_covariance_that_shrinks_tells_nothing_of_motions() -> None:
     path, local, _ = dead_reckoning(3, 30)
     local[20:] *= 0.01
-    found = accumulated(path.poses, local)[1]
+    found = accumulated(path.poses, local, 1)
     assert np.isnan(found[19]).all()
     assert np.isfinite(found[:19]).all()
 
