@@ -304,7 +304,7 @@ def judge(
 
     Reads TUM, EuRoC, OpenVINS and cnspy files, topics of ROS bags (BAG:/topic) and run folders.
     NEES is 1 where covariances are right; the last column is what mends them. What no file states
-    of a covariance is told from the errors, and marked as a guess. Without --truth a run of fgslam
+    of a covariance is found from the errors, and marked as a guess. Without --truth a run of fgslam
     is judged by two halves of its landmarks.
 
     Args:

@@ -124,8 +124,8 @@ def guess_tangent(
         return taken, "", fitting
     others = [str(one) for one in dict.fromkeys((*kept, overall)) if one != taken][:3]
     why = "covariances grow as by dead reckoning, " if 0 < len(grown) < len(likely) else ""
-    doubt = f", not surely: perhaps {' or '.join(others)}" if others else ""
-    return taken, f"guess: {why}the likeliest given the errors{doubt}", fitting
+    rivals = f", not surely: perhaps {' or '.join(others)}" if others else ""
+    return taken, f"guess: {why}the likeliest given the errors{rivals}", fitting
 
 
 def _misfit(local: FloatArray, errors: FloatArray) -> tuple[float, float, FloatArray]:

@@ -121,7 +121,7 @@ def judge(
         covariance: covariances of the one estimate, in a file of their own.
         tangent: what the covariances are of, where no file states it: `rotation_first` or
             `translation_first`, one of `local`, `global`, `split_local`, `split_global`, and
-            `degrees` or `radians`, with commas; what is left out is told from the errors.
+            `degrees` or `radians`, with commas; what is left out is found from the errors.
 
     Raises:
         ConfigError: an argument is wrong.
@@ -219,9 +219,9 @@ def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Pat
     if is_run_folder(path):
         path = path / load_config(path / RUN_MARKER).estimator.title
     path = path / _FINAL if (path / _FINAL).is_file() else path
-    beside = path.with_name("covariance.csv")
-    if path.name == _FINAL and covariance is None and beside.is_file():
-        covariance = beside
+    known = path.with_name("covariance.csv")
+    if path.name == _FINAL and covariance is None and known.is_file():
+        covariance = known
     run = path.parent.parent
     return read_stated(path, covariance), (run, path.parent.name) if is_run_folder(run) else None
 
