@@ -75,6 +75,7 @@ class ErrorColumns:
     _order: Kept[GrowingColumns]
     _map: Kept[GrowingColumns]
     _free: Kept[IntArray]
+    _recent: Kept[list[tuple[FloatArray, FloatArray]]]
 
     def __init__(self, count: int, kind: type = np.float64, **more: FloatArray) -> None:
         """All zero, the map empty.
@@ -86,6 +87,7 @@ class ErrorColumns:
         """
         self._held = False
         self._pose_columns = np.zeros((6, count))
+        self._recent = []  # poses and their columns, the newest last
         self._order = GrowingColumns(ids=np.empty(0, np.int64), row=np.empty(0, np.int64))
         """Identities, ascending, and the rows that are theirs in the map; free ones have none."""
         self._map = GrowingColumns(columns=np.empty((0, 3, count), kind), **more)
@@ -103,6 +105,18 @@ class ErrorColumns:
             gone[places[known]] = True
             self._free = np.concatenate([self._free, self._order["row"][gone]])
             self._order.drop(gone)
+
+    def columns_of_motions(self, wTc: FloatArray) -> dict[int, FloatArray]:
+        """Columns (6, m) of the motions over LAGS frames to the newest pose.
+
+        That is kept for those of later frames.
+        """
+        self._recent = [*self._recent, (wTc, self._pose_columns)][-max(LAGS) - 1 :]
+        known = [lag for lag in LAGS if lag < len(self._recent)]
+        return {lag: self._since(wTc, *self._recent[-lag - 1]) for lag in known}
+
+    def _since(self, wTc: FloatArray, earlier: FloatArray, columns: FloatArray) -> FloatArray:
+        return self._pose_columns - adjoint(inverse(wTc) @ earlier) @ columns
 
     # ----------------------------------------------------------------------------------------
 
@@ -271,6 +285,14 @@ class ConsiderCovariance(ErrorColumns):
             return _NONE  # one for all frames: a smoother keeps that of each
         root = self._pose_columns @ self._terms.deviations
         return np.asarray(root @ root.T)
+
+    def motions(self, wTc: FloatArray) -> dict[int, FloatArray]:
+        """(6, 6) what they add to the covariances of the motions over LAGS frames to it."""
+        root = self._terms.deviations
+        if root is None:
+            return {}
+        motions = self.columns_of_motions(wTc).items()
+        return {lag: congruence(columns, root @ root.T) for lag, columns in motions}
 
     def pose(self, newest: Prediction) -> Prediction:
         """The newest pose with what the terms add to its covariance."""
@@ -490,7 +512,7 @@ class SampledErrors(ErrorColumns):
 
     _terms: Kept[RigTerms]
     _noise: Kept[Persistence]
-    _recent: Kept[list[tuple[FloatArray, FloatArray]]]
+    _marked: Kept[tuple[FloatArray, FloatArray] | None]
 
     def __init__(self, solver: EgoMotionSolver, off: bool = False) -> None:
         """The first pose is known, the map empty.
@@ -508,7 +530,7 @@ class SampledErrors(ErrorColumns):
         self._sensor = solver.sensor
         self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
-        self._recent = []  # poses and their columns, the newest last
+        self._marked = None  # pose and columns, since which errors are asked for
         self._taken = 1.0  # variance over the stated one that the newest pose took
         self._seen: tuple[IntArray, ObservedColumns, FloatArray] | None = None
         """Matches of the newest frame: rows of their landmarks, and the columns of these before."""
@@ -600,20 +622,23 @@ class SampledErrors(ErrorColumns):
         )
 
     def motions(self, wTc: FloatArray) -> FloatArray:
-        """(l, 6, 6) covariances of the motions over LAGS frames to the newest pose, NaN for none.
+        """(l, 6, 6) covariances of the motions over LAGS frames to the newest pose; or NaN."""
+        known = {} if self._off else self.columns_of_motions(wTc)
+        none, freedom = np.full((6, 6), np.nan), self._solver.floor.rigid_dof
+        return np.array(
+            [self._covariances(known[lag], freedom) if lag in known else none for lag in LAGS]
+        )
 
-        The newest pose is kept for those of later frames.
-        """
-        out = np.full((len(LAGS), 6, 6), np.nan)
+    def mark(self, wTc: FloatArray) -> None:
+        """The newest pose is given from elsewhere: :meth:`since_marked` is of what comes after."""
+        self._marked, self._recent = (wTc, self._pose_columns), []
+
+    def since_marked(self, wTc: FloatArray) -> FloatArray | None:
+        """(6, 6) of the motion since the marked pose, or the first one; None if it is not known."""
         if self._off:
-            return out
-        for found, lag in zip(out, LAGS, strict=True):
-            if lag <= len(self._recent):
-                earlier, columns = self._recent[-lag]
-                off = self._pose_columns - adjoint(inverse(wTc) @ earlier) @ columns
-                found[:] = self._covariances(off, self._solver.floor.rigid_dof)
-        self._recent = [*self._recent, (wTc, self._pose_columns)][-max(LAGS) :]
-        return out
+            return None
+        off = self._since(wTc, *self._marked) if self._marked else self._pose_columns
+        return self._covariances(off, self._solver.floor.rigid_dof)
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with the covariances of their errors; those without keep what they have."""

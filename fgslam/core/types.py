@@ -709,6 +709,7 @@ class Estimate(Brief):
         relative: by :data:`LAGS`, of those that are known, (n - lag, 6, 6) covariances of the
             motions over so many frames, by the joint covariance of both poses, in the tangent space
             at the motion's end; NaN where one is not known.
+        online_relative: the same of motions between poses as they were first estimated.
     """
 
     trajectory: Trajectory
@@ -718,6 +719,7 @@ class Estimate(Brief):
     noise_factor: float | None = None
     gyroscope: GyroscopeBias | None = None
     relative: Mapping[int, FloatArray] = field(default_factory=dict)
+    online_relative: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def of(self, frame: PoseFrame, rig: CameraRig) -> Estimate:
         """The same with poses and their covariances of another frame (:meth:`Trajectory.of`)."""
@@ -726,5 +728,14 @@ class Estimate(Brief):
             return self
         gTf = rig.fTc(frame) @ inverse(rig.fTc(self.trajectory.frame))
         covariances = change_tangent_frame(gTf, self.covariances)
-        relative = {lag: change_tangent_frame(gTf, one) for lag, one in self.relative.items()}
-        return replace(self, trajectory=trajectory, covariances=covariances, relative=relative)
+        relative, online = (
+            {lag: change_tangent_frame(gTf, one) for lag, one in known.items()}
+            for known in (self.relative, self.online_relative)
+        )
+        return replace(
+            self,
+            trajectory=trajectory,
+            covariances=covariances,
+            relative=relative,
+            online_relative=online,
+        )

@@ -169,7 +169,7 @@ _MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], 
     ).sliding_window_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
     "batch": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.smoothers.batch"
-    ).batch_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    ).batch_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior, ego),
 }
 """By kind what makes an estimator, at its prior pose."""
 

@@ -209,14 +209,15 @@ class LandmarkKalman:
         """Trajectory as filtered, corrected by loops, and the map."""
         rows = self._rows
         held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
-        motions = np.array(self._motions).reshape(-1, len(LAGS), 6, 6)
+        relative = motions_by_lag(self._motions)
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
             self._errors.landmarks(held),
             tuple(self._drive.remarks),
             noise_factor=1.0,
-            relative={lag: motions[lag:, k] for k, lag in enumerate(LAGS)},
+            relative=relative,
+            online_relative=relative,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -261,6 +262,17 @@ class LandmarkKalman:
         """
         self._current = current
         self._rows.positions[self._rows.rows(ids)] = positions
+        self._errors.mark(current.wTc)
+
+    @property
+    def since_correction(self) -> FloatArray | None:
+        """(6, 6) covariance of the motion since :meth:`correct`; None where none is sampled."""
+        return self._errors.since_marked(self._current.wTc)
+
+    @property
+    def motions(self) -> FloatArray:
+        """(l, 6, 6) covariances of the motions over LAGS frames to the last pose; or NaN."""
+        return self._motions[-1]
 
     def restart(self, observed: Observations) -> None:
         """Restarts known landmarks from one observation each in the last frame: they moved."""
@@ -283,6 +295,12 @@ class LandmarkKalman:
         poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
         self._rows.positions[known] = change.moved(poses, self._rows.positions[known])
         return change
+
+
+def motions_by_lag(motions: list[FloatArray]) -> dict[int, FloatArray]:
+    """By LAGS (n - lag, 6, 6) of what (l, 6, 6) each frame has of the motions to it."""
+    found = np.array(motions).reshape(-1, len(LAGS), 6, 6)
+    return {lag: found[lag:, k] for k, lag in enumerate(LAGS)}
 
 
 def moved_share(

@@ -27,16 +27,24 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Floor, LandmarkMap, Prediction
+from fgslam.frontend.settings import EgoMotionSettings
 
 
 def batch_smoother(
-    sensor: CameraRig, settings: BatchSettings, floor: Floor, prior: Prediction
+    sensor: CameraRig,
+    settings: BatchSettings,
+    floor: Floor,
+    prior: Prediction,
+    ego_motion: EgoMotionSettings,
 ) -> MapSmoother:
-    """Estimator of kind ``batch``, at the prior pose with an empty map."""
+    """Estimator of kind ``batch``, at the prior pose with an empty map.
+
+    Poses on the way are the tracker's: their covariances are of its errors, by ``ego_motion``.
+    """
     if settings.method == "gnc":
         # GNC is its own kernel; the graph's factors must be plain.
         settings = dataclasses.replace(settings, kernel=KernelSettings("none"))
-    problem = GraphProblem.of(sensor, settings, floor, prior)
+    problem = GraphProblem.of(sensor, settings, floor, prior, ego_motion=ego_motion)
     return MapSmoother(problem, BatchSolver(problem, settings))
 
 

@@ -512,6 +512,11 @@ class Eliminated:
         """(6, 6) marginal of the window's pose in a row."""
         return self.joint(row, np.empty(0, np.int64))
 
+    def poses(self, rows: list[int]) -> FloatArray:
+        """(6k, 6k) joint covariance of the window's poses in some rows."""
+        at = (self._r + 6 * np.array(rows)[:, None] + np.arange(6)).ravel()
+        return self._covariance[np.ix_(at, at)]
+
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by rows."""
         k, at = len(landmarks), self._r + 6 * pose + np.arange(6)

@@ -568,6 +568,8 @@ class Smoothed:
         values: GTSAM values of the poses and landmarks that the solver holds.
         last: pose ``wTc`` (4, 4) and covariance (6, 6) of the frame that entered last.
         since: frame; the values hold no landmark that was seen last before it.
+        earlier: by :data:`~fgslam.core.types.LAGS` joint covariances (12, 12) of the pose so many
+            frames before the last one, and of that; of those that are known.
         by_loop: a loop moved the map: landmarks that the solver does not hold move with the camera.
     """
 
@@ -575,6 +577,7 @@ class Smoothed:
     last: Prediction
     since: int = 0
     by_loop: bool = False
+    earlier: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 class GraphSolver(Protocol):

@@ -23,7 +23,7 @@ from fgslam.backend.smoothers.keyframes import Segments
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
-from fgslam.core.types import Floor, LandmarkMap, Prediction
+from fgslam.core.types import LAGS, Floor, LandmarkMap, Prediction
 from fgslam.factors.graphs import (
     is_pose,
     isam2_parameters,
@@ -70,9 +70,22 @@ class Isam2Solver(WholeGraphSolver):
         self._updated = frame
         self._flush()
         last = self.builder.frames[-1]
-        return Smoothed(
-            self.values, Prediction(poses_of_frame(self.values, last), self._covariance(last))
-        )
+        here = Prediction(poses_of_frame(self.values, last), self._covariance(last))
+        return Smoothed(self.values, here, earlier=self._earlier(last))
+
+    def _earlier(self, last: int) -> dict[int, FloatArray]:
+        """Of the last poses, which are at the root of the tree."""
+        inside = [lag for lag in LAGS if last - lag in self.builder.frames[-max(LAGS) - 1 :]]
+        keys = {lag: pose_key(last - lag) for lag in (0, *inside)}
+        try:
+            joint = self.tree.jointMarginalCovariance(list(keys.values()))
+        except RuntimeError:
+            return {}
+        pairs = {lag: (keys[lag], keys[0]) for lag in inside}
+        return {
+            lag: np.block([[joint.at(row, column) for column in two] for row in two])
+            for lag, two in pairs.items()
+        }
 
     def _flush(self) -> None:
         """Brings the frames since the last update in."""

@@ -55,7 +55,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.sensors import CameraRig, Increment
-from fgslam.core.types import EgoMotion, Floor, LandmarkMap, Prediction
+from fgslam.core.types import LAGS, EgoMotion, Floor, LandmarkMap, Prediction
 from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 
@@ -112,7 +112,8 @@ class FixedLagSolver:
         last = len(self.poses) - 1
         for frame in frames:
             self._covariances[frame] = self._covariance(frame)
-        return Smoothed(self.window.values(), Prediction(self.poses[last], self._covariances[last]))
+        here = Prediction(self.poses[last], self._covariances[last])
+        return Smoothed(self.window.values(), here, earlier=earlier_poses(self._at_last()))
 
     def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
@@ -244,6 +245,13 @@ class FixedLagSolver:
         return np.asarray(kept[0])
 
 
+def earlier_poses(solved: Solved) -> dict[int, FloatArray]:
+    """Joint covariances (12, 12) of poses so many frames before the window's last, and of that."""
+    *_, last = frames = list(solved.frames)
+    rows = {lag: frames.index(last - lag) for lag in LAGS if last - lag in frames}
+    return {lag: solved.eliminated.poses([row, len(frames) - 1]) for lag, row in rows.items()}
+
+
 _HOLD_A_POSE = 6
 """Landmarks in three dimensions: twice as many as determine a pose."""
 
@@ -354,7 +362,8 @@ class SlidingWindowSolver(WholeGraphSolver):
         if not frame:
             self._solved_at = min(_SECOND - self._settings.update_every, 0)
         last = self._measured(solved, len(solved.frames) - 1)
-        return Smoothed(self.window.values(), last, self.window.frames[0])
+        earlier = earlier_poses(solved)
+        return Smoothed(self.window.values(), last, self.window.frames[0], earlier=earlier)
 
     def recalibrate(self, change: RigChange) -> None:
         """Looks again at the window; what has left it moves with where it was seen last."""

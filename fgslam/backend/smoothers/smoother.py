@@ -14,13 +14,14 @@ The parts: a tracker (:class:`~fgslam.backend.filters.kalman.LandmarkKalman`), a
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import placed, require_finite
-from fgslam.backend.filters.kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman, motions_by_lag
 from fgslam.backend.loops import CLOSURE_FACTOR, FREE, Constraint, starts_new_part
 from fgslam.backend.persistence import learn_from
 from fgslam.backend.protocol import recalibrated
@@ -39,7 +40,14 @@ from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.window import WindowValues
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, transform_to_world
+from fgslam.core.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    motion_covariance,
+    reorthonormalise,
+    transform_to_world,
+)
 from fgslam.core.sensors import (
     CameraRig,
     Increment,
@@ -50,6 +58,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.store import pack, unpack
 from fgslam.core.types import (
+    LAGS,
     EgoMotion,
     EgoMotionStatus,
     Estimate,
@@ -60,6 +69,7 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.factors.graphs import landmarks_in, pose_key, poses_of_frame
+from fgslam.frontend.settings import EgoMotionSettings
 
 
 class Smoother:
@@ -88,6 +98,9 @@ class Smoother:
         self._eras: list[int] = []
         self._considered = ConsiderCovariance(problem.sensor, problem.floor)
         self._added: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
+        self._earlier: Mapping[int, FloatArray] = {}  # of the last frame, as in Smoothed
+        self._online: list[Prediction] = []  # the last poses as first estimated
+        self._motions: list[FloatArray] = []  # (l, 6, 6) a frame
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Tracks the frame, adds it to the graph, solves the graph if it is time to.
@@ -118,6 +131,7 @@ class Smoother:
         current = self._current(tracking)
         self._considered.observe(increment, current.wTc)
         self._added.append(self._considered.of_pose())
+        self._motions.append(self._motions_to(current))
         covariance = current.covariance + self._added[-1]
         return dataclasses.replace(stats, wTc=current.wTc, covariance=covariance, closed=closed)
 
@@ -183,8 +197,11 @@ class Smoother:
 
     def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
         smoothed = self.solver.solve_if_due(tracked.frame, closes_loop)
+        self._earlier = {}
         if smoothed is not None:
             last = smoothed.last
+            if entered.frame == tracked.frame:
+                self._earlier = smoothed.earlier
             if self._segments is not None:
                 last = _moved_on(last, inverse(entered.wTc) @ tracked.wTc)
             self._take_over(smoothed, last)
@@ -230,9 +247,31 @@ class Smoother:
             return self._smoothed
         moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
         drift = congruence(moved, self._smoothed.covariance)
-        weighed = self.builder.noise.power / tracking.noise  # as the graph weighs it
-        since = weighed * tracking.covariance
+        since = self.tracker.since_correction
+        if since is None:
+            weighed = self.builder.noise.power / tracking.noise  # as the graph weighs it
+            since = weighed * tracking.covariance
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + since))
+
+    def _motions_to(self, current: Prediction) -> FloatArray:
+        """(l, 6, 6) of the motions over LAGS frames, from poses as first estimated to the last one.
+
+        Errors of the last pose are independent of the corrections of an earlier one since it was
+        first estimated: it is as much less certain as it was then. NaN where that is not known.
+        """
+        out, of_rig = self.tracker.motions.copy(), self._considered.motions(current.wTc)
+        for row, lag in enumerate(LAGS):
+            if lag in self._earlier and lag <= len(self._online):
+                before, joint = self._online[-lag], self._earlier[lag]
+                corrected = _positive(before.covariance - joint[:6, :6])
+                motion = inverse(before.wTc) @ current.wTc
+                found = motion_covariance(
+                    motion, joint[:6, :6] + corrected, joint[6:, 6:], joint[:6, 6:]
+                )
+                out[row] = self._floor.allowed_part(current.wTc, found)
+            out[row] += of_rig.get(lag, 0.0)
+        self._online = [*self._online, current][-max(LAGS) :]
+        return out
 
     # -- what is asked of it -------------------------------------------------------------------
 
@@ -277,6 +316,7 @@ class Smoother:
                 for lag, one in relative.items()
                 if (n := len(self.inputs)) > lag
             },
+            online_relative=motions_by_lag(self._motions),
         )
 
     def _solved(self) -> Solution:
@@ -350,6 +390,12 @@ class Smoother:
             self.update(increment, tracking)
 
 
+def _positive(difference: FloatArray) -> FloatArray:
+    """The part (6, 6) of a difference of covariances that is one."""
+    variances, directions = np.linalg.eigh(0.5 * (difference + difference.T))
+    return np.asarray((directions * np.maximum(variances, 0.0)) @ directions.T)
+
+
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
     """The present frame's pose, as far from the one that entered last as it was tracked."""
     covariance = congruence(adjoint(inverse(motion)), last.covariance)
@@ -397,9 +443,13 @@ class GraphProblem:
         floor: Floor,
         prior: Prediction,
         remember: bool = True,
+        ego_motion: EgoMotionSettings | None = None,
     ) -> GraphProblem:
-        """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's."""
-        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
+        """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's.
+
+        ``ego_motion`` as LandmarkKalman's: of a solver that leaves the poses on the way to it.
+        """
+        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior, ego_motion)
         builder = GraphBuilder(sensor, settings, floor, prior, remember)
         return GraphProblem(sensor, settings, floor, prior, tracker, builder)
 
