@@ -234,12 +234,17 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
             "nees_best": _as_json(judge([normalised(*best[0])])),
-            "nees_relative": _relative(estimate, of_camera.trajectory),
+            "nees_relative": _relative(
+                estimate.trajectory, estimate.relative, of_camera.trajectory
+            ),
             "coverage": _coverage(*final_errors),
             "online": _online(online, truth.trajectory, sound.trajectory, judged["online_pose"])
             | {
                 "coverage": _coverage(*online_errors),
                 "nees_best": _as_json(judge([normalised(*best[1])])),
+                "nees_relative": _relative(
+                    answer.online, estimate.online_relative, of_camera.trajectory
+                ),
             },
             "landmark_rmse_m": None if errors is None else errors.rmse_m,
             "landmark_median_m": None if errors is None else errors.median_m,
@@ -336,22 +341,41 @@ def _pose_errors(
     return pose_errors(trajectory.poses[rows], poses), covariances[rows]
 
 
-def _relative(estimate: Estimate, truth: Trajectory | None) -> dict[str, JsonValue]:
-    """NEES of the motions over so many frames, both ends of which have a truth, by their number."""
+def _relative(
+    path: Trajectory, relative: Mapping[int, FloatArray], truth: Trajectory | None
+) -> dict[str, JsonValue]:
+    """NEES of the motions over so many frames, both ends of which have a truth, by their number.
+
+    Of their ``lengths`` alone, too: these need no orientation of the truth.
+    """
     if truth is None:
         return {}
-    rows, true_rows = associate(estimate.trajectory.timestamps, truth.timestamps)
-    true = np.full((len(estimate.trajectory), 4, 4), np.nan)
+    rows, true_rows = associate(path.timestamps, truth.timestamps)
+    true = np.full((len(path), 4, 4), np.nan)
     true[rows] = truth.poses[true_rows]
     out: dict[str, JsonValue] = {}
-    for lag, covariances in estimate.relative.items():
+    for lag, covariances in relative.items():
         known = np.isfinite(true[lag:]).all(axis=(1, 2)) & np.isfinite(true[:-lag]).all(axis=(1, 2))
         known &= np.isfinite(covariances).all(axis=(1, 2))
-        at, poses = np.flatnonzero(known), estimate.trajectory.poses
-        motions = inverse(poses[at]) @ poses[at + lag]
-        errors = pose_errors(motions, inverse(true[at]) @ true[at + lag])
-        out[str(lag)] = _as_json(judge([normalised(errors, covariances[at])]))
+        at, poses = np.flatnonzero(known), path.poses
+        motions, truths = (inverse(one[at]) @ one[at + lag] for one in (poses, true))
+        judged = judge([normalised(pose_errors(motions, truths), covariances[at])])
+        lengths = _length_nees(motions, truths, covariances[at])
+        out[str(lag)] = None if judged is None else asdict(judged) | {"lengths": lengths}
     return out
+
+
+_LONG = 3.0  # deviations of a length, from which on it is a normal number
+
+
+def _length_nees(motions: FloatArray, truths: FloatArray, covariances: FloatArray) -> float | None:
+    """Mean NEES of the lengths of motions (n, 4, 4) that are long enough; None of none."""
+    lengths, true = (np.linalg.norm(one[:, :3, 3], axis=1) for one in (motions, truths))
+    along = np.einsum("nji,nj->ni", motions[:, :3, :3], motions[:, :3, 3])  # in the motion's end
+    variances = np.einsum("ni,nij,nj->n", along, covariances[:, 3:, 3:], along)
+    long = lengths**4 > _LONG**2 * variances
+    squared = ((lengths - true) * lengths)[long] ** 2 / variances[long]
+    return float(squared.mean()) if long.any() else None
 
 
 def _coverage(errors: FloatArray, covariances: FloatArray) -> JsonValue:

@@ -221,6 +221,13 @@ _METRICS = tuple(Metric(*row) for row in (
      "consistency: NEES motions|1 5 20 frames", "ratio", "joint"),
     ("nees_motion_20_per_dof", "nees_relative.20.per_dof", RESULT,
      "consistency: NEES motions|1 5 20 frames", "ratio", "joint"),
+    ("nees_motion_1_online", "online.nees_relative.1.per_dof", RESULT,
+     "consistency: motions online|1 5 20 frames", "ratio", "joint", "the same between poses as "
+     "first estimated"),
+    ("nees_motion_5_online", "online.nees_relative.5.per_dof", RESULT,
+     "consistency: motions online|1 5 20 frames", "ratio", "joint"),
+    ("nees_motion_20_online", "online.nees_relative.20.per_dof", RESULT,
+     "consistency: motions online|1 5 20 frames", "ratio", "joint"),
     ("judged_poses", "judged_poses", RESULT),
     ("coverage_final", "coverage.all", RESULT, "consistency: in 2 sigma|final online", ".0%",
      "truth", "pose errors within two sigma; and of each pose as first estimated"),

@@ -444,17 +444,24 @@ class Witnesses:
                 poses[one.row] = by_images[one.row] @ one.iTo
                 chains[one.row], episodes[one.row] = one.covariance, one.episode
         others = self._others(by_images)
-        for lag, known in estimate.relative.items():
+        online = dict(estimate.online_relative)
+        for lag in {**estimate.relative, **online}:
             motions = inverse(poses[:-lag]) @ poses[lag:]
             back, first, last = inverse(motions), chains[:-lag], chains[lag:]
-            one_chain = (episodes[:-lag] == episodes[lag:])[:, None, None]  # errs on from there
-            cross = one_chain * first @ np.swapaxes(adjoint(back), 1, 2)
-            chained = motion_covariance(motions, first, last, cross)
             ways = [(p, back @ inverse(iTo[:-lag]) @ motions @ iTo[lag:]) for p, iTo in others]
-            relative[lag] = known + chained + _mixture(ways)
+            apart = _mixture(ways)
+            if lag in estimate.relative:
+                same = episodes[:-lag] == episodes[lag:]  # one chain errs on from there
+                cross = same[:, None, None] * first @ np.swapaxes(adjoint(back), 1, 2)
+                chained = motion_covariance(motions, first, last, cross)
+                relative[lag] = estimate.relative[lag] + chained + apart
+            if lag in online:  # frames that were moved later stood elsewhere
+                moved = np.maximum(episodes[:-lag], episodes[lag:]) >= 0
+                online[lag] = np.where(moved[:, None, None], np.nan, online[lag] + apart)
         trajectory = Trajectory(estimate.trajectory.timestamps, poses)
         covariances = estimate.covariances + chains + _mixture(others)
-        return replace(estimate, trajectory=trajectory, covariances=covariances, relative=relative)
+        known = replace(estimate, relative=relative, online_relative=online)
+        return replace(known, trajectory=trajectory, covariances=covariances)
 
     def open_covariance(self, wTc: FloatArray) -> FloatArray:
         """(6, 6) to be added to the covariance of the last pose: what is open between the two."""

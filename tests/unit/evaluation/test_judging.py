@@ -146,17 +146,46 @@ def test_verdicts_leave_out_a_truth_that_settles() -> None:
     assert "truth of frames 0 to 3 is off by 2.0 degrees" in judged.more["truth_remark"]
 
 
-@pytest.mark.parametrize("kind", ["odometry", "landmark_kalman", "batch"])
-def test_motions_err_as_the_joint_covariances_of_both_poses_say(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "ends", "online"),
+    [
+        ("odometry", [23, 19, 4], None),
+        ("landmark_kalman", [23, 19, 4], [23, 19, 4]),
+        ("batch", [23, 19, 4], [23, 19, 4]),  # on the way it is a landmark filter
+        ("isam2", [23, 19, 4], [4, 4, 1]),  # solved every fifth frame
+        ("fixed_lag", None, [23, 19, 0]),  # of ten frames
+    ],
+)
+def test_motions_err_as_the_joint_covariances_of_both_poses_say(
+    kind: str, ends: list[int] | None, online: list[int] | None
+) -> None:
     drive = Drive(frames=24, points=70)
     simulated = simulate(drive, np.random.default_rng(5))
     log = MeasurementLog(RIG, {"kind": "recorded"}, simulated.increments)
     truth = Truth(Trajectory(log.timestamps, np.array(simulated.poses)))
-    relative = judge_replay(replay(log, kind), truth).metrics.more["nees_relative"]
-    assert set(relative) == {"1", "5", "20"}
-    assert [relative[lag]["items"] for lag in ("1", "5", "20")] == [23, 19, 4]
-    for lag in ("1", "5"):
-        assert 0.5 < relative[lag]["per_dof"] < 2.0
+    more = judge_replay(replay(log, kind), truth).metrics.more
+    for items, found in ((ends, more["nees_relative"]), (online, more["online"]["nees_relative"])):
+        if items is None:
+            assert found == {}
+            continue
+        assert [(found[lag] or {"items": 0})["items"] for lag in ("1", "5", "20")] == items
+        for lag in ("1", "5"):
+            assert 0.4 < found[lag]["per_dof"] < 2.0
+            assert 0.1 < found[lag]["lengths"] < 3.0
+
+
+def test_lengths_of_motions_need_no_orientation_of_the_truth() -> None:
+    simulated = simulate(Drive(frames=24, points=70), np.random.default_rng(5))
+    log = MeasurementLog(RIG, {"kind": "recorded"}, simulated.increments)
+    true, turned = np.array(simulated.poses), np.array(simulated.poses)
+    turned[:, :3, :3] = turned[:, :3, :3] @ se3_exp(np.array([0.0, 0.1, 0.0, 0, 0, 0]))[:3, :3]
+    found = replay(log, "landmark_kalman")
+    right, wrong = (
+        judge_replay(found, Truth(Trajectory(log.timestamps, poses))).metrics.more["nees_relative"]
+        for poses in (true, turned)
+    )
+    assert wrong["5"]["per_dof"] > 10.0 * right["5"]["per_dof"]
+    assert wrong["5"]["lengths"] == pytest.approx(right["5"]["lengths"], rel=1e-9)
 
 
 def test_motions_of_the_left_camera_have_the_same_nees() -> None:

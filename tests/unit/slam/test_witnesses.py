@@ -148,6 +148,7 @@ def test_what_passed_a_standing_robot_is_recognised_when_the_scene_is_back() -> 
         assert moved_within_3_sigma(estimate, 5, stands(9) - stands(4))[4]
         steps = estimate.relative[1][BEGINS - 1 : BEGINS + 1, 3, 3]  # by odometry alone
         assert (steps >= NOISE[3, 3]).all()
+        assert np.isnan(estimate.online_relative[1][BEGINS]).all()  # it was elsewhere
 
 
 def test_frozen_cameras_are_a_fault_where_odometry_has_moved() -> None:
