@@ -33,8 +33,10 @@ from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, Rows, StateArrays
 from fgslam.core.correction import (
     EXPECTED_PX,
+    FIELD_PX,
     SHARED,
     RigCorrection,
+    displacements,
     field_displacements,
     field_modes,
     shared_displacements,
@@ -184,7 +186,7 @@ _NONE = np.zeros((6, 6))
 class RigTerms:
     """The terms in SHARED of a rig that calibrates itself, then the modes of its field: unknown.
 
-    Of a rig that is exact, or that is taken as stated, none is unknown.
+    Of a rig that is taken as stated TERMS are, too; of one that is exact none.
     """
 
     deviations: Kept[FloatArray | None]
@@ -200,6 +202,10 @@ class RigTerms:
         """(q, q) lower root of their covariance; None: they are known."""
         self._applied = np.empty(0)
         self._field_px = 0.0
+        if sensor.stated and self.rig is not None:
+            stated = RigCorrection.none(self.rig)
+            self.count += len(stated.values)
+            self._hear(stated.values, FIELD_PX)
 
     @property
     def covariance(self) -> FloatArray | None:
@@ -217,6 +223,8 @@ class RigTerms:
             return np.zeros((len(measured), 3, self.count))
         pixels = pixels_of(self.rig, measured)
         of_pixels = [shared_displacements(self.rig, pixels), field_displacements(self.rig, pixels)]
+        if self.rig.stated:
+            of_pixels.append(displacements(self.rig, pixels))
         return fused(self.rig, np.concatenate(of_pixels, axis=2))
 
     def _hear(self, correction: FloatArray | None, field_px: float) -> None:
@@ -230,12 +238,15 @@ class RigTerms:
         shared = shared_covariance(dataclasses.replace(none, values=correction))
         self.deviations = field_px * np.eye(self.count)
         self.deviations[: len(SHARED), : len(SHARED)] = np.linalg.cholesky(shared)
+        if self.rig.stated:
+            own = slice(-len(correction), None)
+            self.deviations[own, own] = np.linalg.cholesky(none.covariance)
 
 
 class ConsiderCovariance(ErrorColumns):
     """Derivatives of the newest pose and of the landmarks by what is unknown of the rig.
 
-    Of a rig that is exact, or that is taken as stated, nothing is added.
+    Of a rig that is exact nothing is added.
     """
 
     _terms: Kept[RigTerms]

@@ -243,6 +243,8 @@ class CameraRig(Brief):
             what one leaves (:data:`fgslam.core.correction.SHARED`).
         places: ``all`` images tell the measured column and row, by least squares; or the
             ``reference`` alone, where the others are measured by shifts from it.
+        stated: the calibration is taken as it is, and no drive corrects it: covariances contain
+            what it leaves between the cameras, too (:data:`fgslam.core.correction.TERMS`).
     """
 
     width: int
@@ -256,6 +258,7 @@ class CameraRig(Brief):
     bTc: FloatArray
     exact: bool = False
     places: RigPlaces = field(default="all", repr=False)
+    stated: bool = field(default=False, repr=False)
     angles = ()  # none of the three is one
 
     @property

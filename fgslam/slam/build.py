@@ -112,9 +112,13 @@ _LOCATING_STREAM = 12  # of random numbers, next to those of the recording
 
 
 def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:
-    """The rig as the front-end measures with it: which images tell a place."""
+    """The rig as the front-end measures with it: which images tell a place, what corrects it."""
     by_patches = settings.stereo.by_patches(rig.cameras)
-    return dataclasses.replace(rig.plain(), places="reference" if by_patches else "all")
+    return dataclasses.replace(
+        rig.plain(),
+        places="reference" if by_patches else "all",
+        stated=not (calibrates_itself(settings) or has_depth_camera(settings)),
+    )
 
 
 def made_or_given(

@@ -32,7 +32,7 @@ from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
-from fgslam.core.correction import RigCorrection
+from fgslam.core.correction import FIELD_PX, RigCorrection
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log, transform_to_world
 from fgslam.core.sensors import CameraRig, Increment, LoopClosure, Observations, Odometry
@@ -203,11 +203,12 @@ class GraphBuilder:
 
     @property
     def uncertain_rig(self) -> RigCorrection | None:
-        """A rig that calibrates itself, with the correction applied last; None for a known one."""
-        if self._corrected is None:
-            return None
-        values, field_px = self._corrected
+        """With the correction applied last, or as stated; None for a rig that is known."""
         none = RigCorrection.none(self._sensor)
+        if self._corrected is None:
+            stated = self._sensor.stated and not self._sensor.exact
+            return dataclasses.replace(none, field_px=FIELD_PX) if stated else None
+        values, field_px = self._corrected
         return dataclasses.replace(none, values=values, field_px=field_px)
 
     @property

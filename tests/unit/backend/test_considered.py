@@ -344,6 +344,8 @@ def seeing(increment: Increment, matches: int) -> Increment:
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
 CALIBRATED = RigCorrection.none(dataclasses.replace(RIG, exact=False))
+STATED = RigCorrection.none(dataclasses.replace(RIG, exact=False, stated=True))
+"""Of a rig that no drive corrects."""
 
 ONLINE: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),
@@ -457,8 +459,8 @@ def pose_nees_per_dof(poses: FloatArray, covariances: FloatArray, truth: FloatAr
 
 @pytest.mark.parametrize(
     ("rig", "drives"),
-    [(CALIBRATED, 12), pytest.param(UNEVEN, 48, marks=pytest.mark.slow)],
-    ids=["terms", "field"],
+    [(CALIBRATED, 12), (STATED, 12), pytest.param(UNEVEN, 48, marks=pytest.mark.slow)],
+    ids=["terms", "as stated", "field"],
 )
 def test_rigs_that_are_off_as_assumed_leave_consistent_poses(
     rig: RigCorrection, drives: int
@@ -593,6 +595,28 @@ def test_a_restored_filter_of_an_uncertain_rig_continues_to_the_same_bits(kind: 
     restore(second, dict(sorted(state_of(first).items())))  # as a saved map's session has it
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), through.estimate())
+
+
+@pytest.mark.parametrize("kind", ["landmark_kalman", "isam2"])
+def test_sigmas_hold_what_a_calibration_leaves_where_no_drive_corrects_it(kind: str) -> None:
+    """Shares within two sigmas; all terms are off as calibrations are taken to be."""
+    rng, p = np.random.default_rng(8), len(STATED.values)
+    online, final = [], []
+    for seed in range(6):
+        terms = np.zeros(len(ALL))
+        terms[:p] = rng.multivariate_normal(np.zeros(p), STATED.covariance)
+        drive = drawn(seed, frames=12)
+        estimator = make_estimator(STATED.rig, ONLINE[kind], FREE)
+        seen = [displaced(each, terms) for each in drive.increments]
+        stats, found = play(estimator, seen, FREE, STATED.rig)[1:], estimator.estimate()
+        poses = (np.array([each.wTc for each in stats]), found.trajectory.poses[1:])
+        covariances = (np.array([each.covariance for each in stats]), found.covariances[1:])
+        for share, its, known in zip((online, final), poses, covariances, strict=True):
+            share.append(within(pose_errors(its, drive.poses[1:]), known))
+    assert min(np.mean(online), np.mean(final)) > 0.85, (online, final)
+    exact = make_estimator(EXACT.rig, ONLINE[kind], FREE)
+    known = play(exact, seen, FREE, EXACT.rig)[-1].covariance
+    assert np.trace(stats[-1].covariance) > 10.0 * np.trace(known)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.runs.config import make_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.build import make_estimator, make_pipeline, require_support
+from fgslam.slam.build import as_measured, make_estimator, make_pipeline, require_support
 
 RIG = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 
@@ -46,6 +46,18 @@ def test_a_camera_made_up_from_depth_cannot_have_moved_but_its_scale_is_unknown(
     assert pipeline.watch is None
     # Covariances contain what a correction of this size leaves: the baseline is the scale of depth.
     np.testing.assert_array_equal(pipeline.stated, np.zeros(len(term_names(pair))))
+    assert not as_measured(pair, depth).stated
+
+
+def test_a_rig_that_no_drive_corrects_is_taken_as_stated() -> None:
+    pair = dataclasses.replace(RIG, vertical_baseline=None)
+    paper = StereoSettings(measurement="paper")
+    for settings, stated in (
+        (FrontendSettings(), False),
+        (FrontendSettings(self_calibration=False), True),
+        (FrontendSettings(stereo=paper), True),
+    ):
+        assert as_measured(pair, settings).stated == stated
 
 
 def test_noise_of_recorded_odometry_is_not_silently_idle_in_the_lab() -> None:
