@@ -19,7 +19,7 @@ from fgslam.cli.options import FrameOptions, RecordingOptions, command
 from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import ConfigError, FgslamError, one_line
 from fgslam.core.memory import ShortageTold
-from fgslam.runs.named_experiments import experiment_names, find_experiment
+from fgslam.runs.named_experiments import find_experiment, list_experiments
 
 if TYPE_CHECKING:
     from fgslam.runs.config import Experiment
@@ -104,7 +104,7 @@ def existing_folder(overwrite: bool, resume: bool = False) -> ExistingFolder:
 # Recordings and experiments
 
 
-@command(app, f"Experiments that come with fgslam: {', '.join(experiment_names())}.")
+@command(app, list_experiments())
 def run(  # noqa: PLR0913 - each option is a parameter
     config: options.Experiment,
     recording: RecordingOptions,
@@ -205,6 +205,24 @@ def demo(out: Path = Path("runs/demo")) -> None:
         out: the run folder; replaced where it is there already
     """
     run(find_experiment(Path("lab_loop")), RecordingOptions(), out, overwrite=True)
+
+
+@command(app)
+def data(name: Annotated[str | None, typer.Argument()] = None, out: Path | None = None) -> None:
+    """List recordings to try, or write one that is made here as a folder of images.
+
+    Args:
+        name (NAME): which one; without it all are listed
+        out (DIR): a new folder for it; default its name
+    """
+    from fgslam.runs.data import offered, write_recording
+
+    if name is None:
+        typer.echo("\n".join(offered()))
+        return
+    with under_way() as (progress, _):
+        then = write_recording(name, out or Path(name), progress)
+    typer.echo(f"next: {then}")
 
 
 @command(app)

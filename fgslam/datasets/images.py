@@ -155,7 +155,7 @@ def require_folder(path: Path, what: str) -> None:
     if not path.is_dir():
         raise DatasetError(
             f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
-            "recording is: --set dataset.path=FOLDER"
+            "recording is: --set dataset.path=FOLDER (fgslam data: where to get some)"
         )
 
 

@@ -6,11 +6,13 @@ install, has them next to the package.
 
 from __future__ import annotations
 
+import re
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
+_READS = re.compile(r"^ +path: \S*/", re.MULTILINE)
 _FOLDERS = (_PACKAGE / "experiments", _PACKAGE.parent / "experiments")
 
 
@@ -23,6 +25,25 @@ def experiments_folder() -> Path:
 def experiment_names() -> tuple[str, ...]:
     """Names that :func:`find_experiment` knows, sorted."""
     return tuple(sorted(path.stem for path in experiments_folder().glob("*.yaml")))
+
+
+def experiments_of_recordings() -> tuple[str, ...]:
+    """Those of :func:`experiment_names` that read a recording which does not come with fgslam.
+
+    Told by one line of each file: what lists them does not load a reader of YAML.
+    """
+    files = (find_experiment(Path(name)) for name in experiment_names())
+    return tuple(f.stem for f in files if _READS.search(f.read_text(encoding="utf-8")))
+
+
+def list_experiments() -> str:
+    """One sentence on all, apart those that need a recording."""
+    needing = experiments_of_recordings()
+    alone = ", ".join(name for name in experiment_names() if name not in needing)
+    return (
+        f"Experiments that come with fgslam: {alone}. With a recording to be fetched "
+        f"('fgslam data' says where; --set dataset.path=FOLDER): {', '.join(needing)}."
+    )
 
 
 def find_experiment(given: Path) -> Path:
