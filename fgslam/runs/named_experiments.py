@@ -42,7 +42,7 @@ def list_experiments() -> str:
     alone = ", ".join(name for name in experiment_names() if name not in needing)
     return (
         f"Experiments that come with fgslam: {alone}. With a recording to be fetched "
-        f"('fgslam data' says where; --set dataset.path=FOLDER): {', '.join(needing)}."
+        f"('fgslam data': where; --set dataset.path=FOLDER): {', '.join(needing)}."
     )
 
 
