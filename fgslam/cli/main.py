@@ -215,7 +215,7 @@ def data(name: Annotated[str | None, typer.Argument()] = None, out: Path | None 
         name (NAME): which one; without it all are listed
         out (DIR): a new folder for it; default its name
     """
-    from fgslam.runs.data import offered, write_recording
+    from fgslam.datasets.offers import offered, write_recording
 
     if name is None:
         typer.echo("\n".join(offered()))

@@ -10,17 +10,13 @@ from typer.testing import CliRunner
 
 from fgslam.cli.main import app
 from fgslam.core.errors import ConfigError, OutputError
+from fgslam.datasets import offers
+from fgslam.datasets.offers import OFFERS, write_recording
 from fgslam.datasets.opening import open_recording
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.runs import data
-from fgslam.runs.config import load_config
-from fgslam.runs.data import OFFERS, write_recording
-from fgslam.runs.named_experiments import (
-    experiment_names,
-    experiments_of_recordings,
-    find_experiment,
-)
-from fgslam.runs.opening import open_sequence
+from fgslam.runs.named_experiments import experiment_names, experiments_of_recordings
+from fgslam.worlds.settings import RenderedLabSettings
 
 
 def quiet(what: str, done: int, total: int) -> None:
@@ -30,9 +26,8 @@ def quiet(what: str, done: int, total: int) -> None:
 def test_the_lab_is_written_as_a_folder_that_opens_with_wheels_and_truth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = load_config(find_experiment(Path("lab_loop")), ["dataset.stop=4"])
-    monkeypatch.setattr(data, "lab_sequence", lambda: open_sequence(short))
-    source = open_sequence(short)
+    source = RenderedLabSequence(RenderedLabSettings(), 0, stop=4)
+    monkeypatch.setattr(offers, "lab_sequence", lambda: source)
     assert write_recording("lab", tmp_path / "lab", quiet) == f"fgslam run {tmp_path / 'lab'}"
     found = open_recording(ImageFolderSettings(path=str(tmp_path / "lab")))
     assert len(found) == len(source) == 4

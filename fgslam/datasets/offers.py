@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
@@ -18,11 +18,14 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.files import make_subfolder, require_output, write_bytes, write_text
 from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.core.types import Trajectory
-from fgslam.runs.units import Progress
 
 if TYPE_CHECKING:
     from fgslam.core.arrays import FloatArray, Image
     from fgslam.core.log import ImageSequence
+
+
+Progress: TypeAlias = Callable[[str, int, int], None]
+"""Called with what is under way, how much is done, and of how much."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +95,10 @@ def _write_lab(folder: Path, progress: Progress) -> None:
 
 def lab_sequence() -> ImageSequence:
     """The paper's drive through the rendered lab."""
-    from fgslam.runs.config import load_config
-    from fgslam.runs.named_experiments import find_experiment
-    from fgslam.runs.opening import open_sequence
+    from fgslam.datasets.rendered import RenderedLabSequence
+    from fgslam.worlds.settings import RenderedLabSettings
 
-    return open_sequence(load_config(find_experiment(Path("lab_loop"))))
+    return RenderedLabSequence(RenderedLabSettings(), 0)
 
 
 def _body_poses(sequence: ImageSequence) -> Iterator[FloatArray]:
