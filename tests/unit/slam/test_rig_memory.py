@@ -75,7 +75,7 @@ def seen(wrong: FloatArray, first: int = 0, frames: int = 12) -> list[tuple[Incr
         wTc = g.se3_exp(np.array([0.0, 0.01 * k, 0.0, 0.0, 0.0, 1.0 * k]))
         local = g.transform_to_camera(wTc, points)
         ids = np.flatnonzero((local[:, 2] > 4.0) & (local[:, 2] < 60.0))
-        at = (RIG.project(local[ids]) @ model.T).reshape(-1, 2, 2)
+        at = (RIG.predict(local[ids]) @ model.T).reshape(-1, 2, 2)
         inside = ((at >= 0.0) & (at < size)).all(axis=(1, 2))
         ids, at = ids[inside], at[inside]
         off = (displacements(RIG, at) @ wrong).reshape(at.shape)
