@@ -21,13 +21,11 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     inverse_spd3,
-    moved_apart,
     point_pose_jacobian,
     pose,
     reorthonormalise,
     se3_exp,
     se3_log,
-    se3_log_jacobian,
     so3_exp,
     transform_to_camera,
 )
@@ -35,16 +33,15 @@ from fgslam.core.sensors import UNKNOWN_DISPARITY_PX, CameraRig, Observations, m
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.pose_fit import ROBUST, fit_pose
 
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
+MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
 _UNKNOWN = UNKNOWN_DISPARITY_PX**2
-_KERNEL_WIDTH = 2.0  # of the robust kernel, standard deviations of a residual
-MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
-_MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
 
 
@@ -57,6 +54,8 @@ class EgoMotionSolver:
         self._settings = settings
         self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
+        self._camera = np.array([sensor.fx, sensor.fy, sensor.cx, sensor.cy, sensor.baseline])
+        self._directions = self.floor.basis(np.eye(4))
         self.noise = MatchNoise()
         """Of the measurements; the caller has it learn each frame."""
         self._judges = settings.outlier_sigmas > 0.0 and settings.weighting != "uniform"
@@ -128,71 +127,20 @@ class EgoMotionSolver:
         information: FloatArray,
         robust: bool,
     ) -> _Minimum:
-        from_predicted = inverse(prediction.wTc)
-        prior = _prior_information(prediction.covariance) if self._settings.prior else None
-        best_cost, damping = np.inf, 0.0
+        """The pose from ``start``; not converged where the matches leave it undetermined."""
+        prior = np.zeros((6, 6))
+        if self._settings.prior:
+            prior = _prior_information(prediction.covariance)
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
-        wTc = best = start
-        hessian, gradient = np.eye(6), np.zeros(6)
-        for iteration in range(1, MAX_ITERATIONS + 1):
-            cost, h, g = self._linearise(wTc, problem, information, robust)
-            if prior is not None:
-                cost, h, g = _add_prior(from_predicted @ wTc, prior, (cost, h, g))
-            if cost <= best_cost * (1.0 + 1e-12):
-                best, best_cost, hessian, gradient = wTc, cost, h, g
-                damping *= 0.1
-            else:
-                damping = max(10.0 * damping, 1e-4)
-                if damping > _MAX_DAMPING:
-                    break
-            step = self._step(best, hessian, gradient, damping)
-            if step is None or not np.isfinite(best_cost):
-                return _Minimum(start, hessian, False, iteration)
-            if np.abs(step).max() < tolerance:
-                break
-            wTc = moved_apart(best, step)
-        return _Minimum(best, hessian, self._determined(best, hessian), iteration)
-
-    def _linearise(
-        self, wTc: FloatArray, problem: PoseProblem, information: FloatArray, robust: bool
-    ) -> tuple[float, FloatArray, FloatArray]:
-        """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
-        points = transform_to_camera(wTc, problem.points)
-        if not in_front(points).all():
-            return np.inf, np.eye(6), np.zeros(6)
-        residual = self.sensor.predict(points) - problem.measurement
-        jacobian = self.sensor.jacobian(points) @ point_pose_jacobian(points)
-        squared = _squared(residual, information)
-        rho, weight = self._kernel(squared, robust)
-        weighted = weight[:, None, None] * (information @ jacobian)
-        flat = weighted.reshape(-1, 6)
-        hessian = flat.T @ jacobian.reshape(-1, 6)
-        return float(rho.sum()), hessian, flat.T @ residual.ravel()
-
-    def _kernel(self, squared: FloatArray, robust: bool) -> tuple[FloatArray, FloatArray]:
-        """Robust cost and weight (k,) of squared normalised residuals."""
-        if not robust:
-            return squared, np.ones_like(squared)
-        width = _KERNEL_WIDTH
-        if self._settings.kernel == "cauchy":
-            ratio = squared / width**2
-            return width**2 * np.log1p(ratio), 1.0 / (1.0 + ratio)
-        norm = np.sqrt(squared)
-        linear = norm > width
-        weight = np.where(linear, width / np.maximum(norm, width), 1.0)
-        return np.where(linear, width * (2.0 * norm - width), squared), weight
-
-    def _step(
-        self, wTc: FloatArray, hessian: FloatArray, gradient: FloatArray, damping: float
-    ) -> FloatArray | None:
-        """The correction (6,), to be applied on the right; None where it is undetermined."""
-        basis = self.floor.basis(wTc)
-        reduced = basis.T @ hessian @ basis
-        reduced.flat[:: len(reduced) + 1] *= 1.0 + damping
-        try:
-            return np.asarray(-(basis @ np.linalg.solve(reduced, basis.T @ gradient)))
-        except np.linalg.LinAlgError:
-            return None
+        kernel = ROBUST.index(self._settings.kernel) if robust else 0
+        wTc, hessian, state = start.copy(), np.zeros((6, 6)), np.zeros(2)
+        fit_pose(
+            problem.points, problem.measurement, information, self._camera, prediction.wTc, prior,
+            self._directions, kernel, tolerance, MAX_ITERATIONS, wTc,
+            hessian, state, np.empty((9, 6, 6)),
+        )  # fmt: skip
+        found = bool(state[1]) and self._determined(wTc, hessian)
+        return _Minimum(wTc if state[1] else start, hessian, found, int(state[0]))
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
         """True if the matches (and the prior) determine all degrees of freedom."""
@@ -354,23 +302,6 @@ def _inverse_spd(matrix: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (inverted + inverted.T))
 
 
-def _add_prior(
-    correction: FloatArray,
-    information: FloatArray,
-    system: tuple[float, FloatArray, FloatArray],
-) -> tuple[float, FloatArray, FloatArray]:
-    """Adds ``|Log(correction)|^2`` of ``predicted^-1 wTc`` in its metric (Lowe 1991)."""
-    cost, hessian, gradient = system
-    deviation = se3_log(correction)
-    jacobian = se3_log_jacobian(deviation)
-    weighted = jacobian.T @ information
-    return (
-        cost + float(deviation @ information @ deviation),
-        hessian + weighted @ jacobian,
-        gradient + weighted @ deviation,
-    )
-
-
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
     """Ego-motion equal to the prediction, for a frame without matches."""
     return EgoMotion(
@@ -477,7 +408,7 @@ class Resection:
 
         The same problem gives the same bits: its samples are always drawn alike.
         """
-        found = [self._solved(start, problem) for start in self._starts(problem)]
+        found = self._solutions(problem)
         if not found:
             nowhere = Prediction(np.eye(4), np.zeros((6, 6)))
             lost = unmeasured(nowhere, EgoMotionStatus.TOO_FEW_MATCHES)
@@ -498,8 +429,18 @@ class Resection:
         rest = problem.select(~self._near(best.wTc, problem))
         if 2 * len(rest) <= int(best.inliers.sum()):
             return len(rest)
-        found = [int(self._solved(start, rest).inliers.sum()) for start in self._starts(rest)]
-        return max(found, default=0)
+        return max((int(one.inliers.sum()) for one in self._solutions(rest)), default=0)
+
+    def _solutions(self, problem: PoseProblem) -> list[EgoMotion]:
+        """Least squares from each start, but those whose matches a solution explains already."""
+        found: list[EgoMotion] = []
+        explained: BoolArray = np.zeros((0, len(problem)), np.bool_)
+        for start in self._starts(problem):
+            agreeing = self._near(start, problem)
+            if not (explained | ~agreeing).all(axis=1).any():
+                found.append(self._solved(start, problem))
+                explained = np.vstack([explained, self._near(found[-1].wTc, problem)])
+        return found
 
     def _solved(self, start: FloatArray, problem: PoseProblem) -> EgoMotion:
         """Least squares over all matches, from a pose that only states where to start."""
