@@ -141,6 +141,22 @@ class Kernel:
         return cache_root() / "kernels" / f"{self._code.__name__.strip('_')}-{digest[:20]}.o"
 
 
+def invert(matrix: Any, size: int) -> bool:
+    """For loops: inverts a definite matrix in place (Gauss and Jordan); False where it is not."""
+    for p in range(size):
+        if not matrix[p, p] > 0.0:
+            return False
+        pivot, matrix[p, p] = 1.0 / matrix[p, p], 1.0
+        for j in range(size):
+            matrix[p, j] *= pivot
+        for i in range(size):
+            if i != p:
+                factor, matrix[i, p] = matrix[i, p], 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[p, j]
+    return True
+
+
 def make_kernels(progress: Callable[[str, int, int], None]) -> None:
     """Makes those of all imported kernels that the cache does not have; reports each."""
     missing = [kernel for kernel in KERNELS if not kernel.is_made]

@@ -1,13 +1,13 @@
 """Kernel that moves and deforms patches until they fit a view: inverse compositional alignment.
 
-With b, G and M of a patch (:mod:`fgslam.frontend.features.anchoring`), and the grey values s that
-the view shows where its map A puts its pixels (Baker and Matthews 2004)::
+With b and G of a patch (:mod:`fgslam.frontend.features.anchoring`), and the grey values s that the
+view shows where its map A puts its pixels (Baker and Matthews 2004)::
 
     p = sum w b s
     (offset, gain) = (G_light + flat)^-1 p_light        light by the first look; G_light (2, 2)
     r = (s - offset) / gain - f                         what remains;
     sum w b r = (p - offset G_1) / gain - G_f           columns of G: no second pass over pixels
-    (t, D) = M sum w b r                                move and deformation
+    (t, D) = (G + prior)^-1 sum w b r                   move and deformation
     A <- A (I + D)^-1,  place <- place - A t
     correlation = 1 / sqrt(1 + |r|^2 / |f - mean|^2)    before the move, weighted
 """
@@ -48,18 +48,11 @@ def _align(  # noqa: PLR0913  kernels take plain arrays
         contrast = max(math.sqrt(max(g[1, 1] / g[0, 0] - (g[0, 1] / g[0, 0]) ** 2, 0.0)), FLAT)
         for _ in range(times):
             sample(grey, scale, places[n], a, size, seen)
-            square = p0 = p1 = p2 = p3 = p4 = p5 = p6 = p7 = 0.0
+            square, p[:] = 0.0, 0.0
             for k in range(pixels):
                 square += weight[k] * seen[k] * seen[k]
-                p0 += room[k, 0] * seen[k]
-                p1 += room[k, 1] * seen[k]
-                p2 += room[k, 2] * seen[k]
-                p3 += room[k, 3] * seen[k]
-                p4 += room[k, 4] * seen[k]
-                p5 += room[k, 5] * seen[k]
-                p6 += room[k, 6] * seen[k]
-                p7 += room[k, 7] * seen[k]
-            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7] = p0, p1, p2, p3, p4, p5, p6, p7
+                for i in range(TERMS):
+                    p[i] += room[k, i] * seen[k]
             n00, n01, n11 = g[0, 0] + FLAT, g[0, 1], g[1, 1] + FLAT
             det = n00 * n11 - n01 * n01
             offset, light = (n11 * p[0] - n01 * p[1]) / det, (n00 * p[1] - n01 * p[0]) / det
@@ -112,25 +105,14 @@ def _align_numpy(  # noqa: PLR0913
         of_rest = (p - offset[:, None] * one) / gain[:, None] - first
         change = (inverse @ of_rest[:, :, None])[:, :, 0]
         with np.errstate(divide="ignore", invalid="ignore"):  # crushed to nothing by one step: lost
-            moved = maps @ _inverse(np.eye(2) + change[:, 4:].reshape(-1, 2, 2))
+            a, b, c, d = 1.0 + change[:, 4], change[:, 5], change[:, 6], 1.0 + change[:, 7]
+            inverted = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+            moved = maps @ inverted.transpose(2, 0, 1)
             move = -(moved @ change[:, 2:4, None])[:, :, 0]
         good = (found > _GAIN[0]) & (found < _GAIN[1])
         good &= np.hypot(move[:, 0], move[:, 1]) < _FARTHEST_PX
         correlation[:] = np.where(good, 1.0 / np.hypot(1.0, unlike), -1.0)
         maps[good], places[good] = moved[good], places[good] + move[good]
-
-
-def _inverse(maps: FloatArray) -> FloatArray:
-    """(n, 2, 2) inverses of matrices (n, 2, 2), whatever they are: not finite where there is none.
-
-    A patch may be crushed to nothing by one step; it is lost then, no error.
-    """
-    (a, b), (c, d) = maps[:, 0].T, maps[:, 1].T
-    out = np.empty_like(maps)
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = d, -b, -c, a
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out /= (a * d - b * c)[:, None, None]
-    return out
 
 
 align_patches = Kernel(

@@ -1,11 +1,10 @@
-"""Kernels that cut patches out of an image, and add up what aligning them needs once.
+"""Kernels that cut patches out of an image, and add up what aligning them needs.
 
 With the grey values f of a patch, their slopes f_x and f_y, and the weights w of its pixels (x, y),
 counted from the middle::
 
     b = (1, f, f_x, f_y, f_x x, f_x y, f_y x, f_y y)    by light (2), a move (2), a deformation (4)
     G = sum w b b^T                                     the patch's gram matrix
-    M = (G + prior)^-1
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.kernels import Kernel
+from fgslam.core.kernels import Kernel, invert
 from fgslam.frontend.features.sift import Float32
 
 TERMS = 8
@@ -83,20 +82,9 @@ def _add_up(cut: Any, size: int, weight: Any, prior: Any, gram: Any, inverse: An
                     gram[n, i, j] += factor * b[k, j]
         for i in range(TERMS):
             for j in range(TERMS):
-                gram[n, i, j] = gram[n, min(i, j), max(i, j)]
-                inverse[n, i, j] = gram[n, i, j]
+                gram[n, i, j] = inverse[n, i, j] = gram[n, min(i, j), max(i, j)]
             inverse[n, i, i] += prior[i]
-        for p in range(TERMS):  # Gauss and Jordan in place: M is definite, and needs no pivots
-            pivot = 1.0 / inverse[n, p, p]
-            inverse[n, p, p] = 1.0
-            for j in range(TERMS):
-                inverse[n, p, j] *= pivot
-            for i in range(TERMS):
-                if i != p:
-                    factor = inverse[n, i, p]
-                    inverse[n, i, p] = 0.0
-                    for j in range(TERMS):
-                        inverse[n, i, j] -= factor * inverse[n, p, j]
+        invert(inverse[n], TERMS)
 
 
 # ------------------------------------------------------------------------------------------
@@ -152,9 +140,8 @@ cut_patches = Kernel(_cut, _cut_numpy, "f4[:,::1] i8 f8[:,::1] f8[:,::1] i8 f4[:
 """(grey, scale, places (n, 2), no deformation (2, 2), size, cut): grey values ``cut`` (n, size^2)
 around places of an image with ``scale`` values of ``grey`` along a pixel."""
 add_up = Kernel(
-    _add_up,
-    _add_up_numpy,
-    "f4[:,::1] i8 f8[::1] f8[::1] f8[:,:,::1] f8[:,:,::1] f8[:,::1]",
-    weighted_terms,
+    *(_add_up, _add_up_numpy, "f4[:,::1] i8 f8[::1] f8[::1] f8[:,:,::1] f8[:,:,::1] f8[:,::1]"),
+    *(weighted_terms, invert),
 )
-"""(cut (n, (size + 2)^2), size, weight (m,), prior (8,), gram, inverse, room (m, 8)): G and M."""
+"""(cut (n, (size + 2)^2), size, weight (m,), prior (8,), gram (n, 8, 8), inverse, room (m, 8)): G,
+and its inverse with the prior added on the diagonal."""

@@ -16,7 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
+from fgslam.core.arrays import FloatArray, Image, Rows
 from fgslam.frontend.features.alignment import align_patches
 from fgslam.frontend.features.anchoring import FLAT, TERMS, add_up, cut_patches, offsets
 from fgslam.frontend.features.matching import pairs_within
@@ -36,8 +36,8 @@ class ReferencePatches(Rows):
     Attributes:
         size: side, pixels; odd.
         cut: (n, (size + 2)^2) their grey values, with a rim of a pixel.
-        gram: (n, 8, 8) and
-        inverse: (n, 8, 8) what :mod:`fgslam.frontend.features.anchoring` makes of these.
+        gram: (n, 8, 8) of :mod:`fgslam.frontend.features.anchoring`.
+        inverse: (n, 8, 8) of that with its prior.
         maps: (n, 2, 2) from the first patch to the present one.
     """
 
@@ -55,12 +55,6 @@ class ReferencePatches(Rows):
         sums = np.empty((0, TERMS, TERMS))
         cut = np.empty((0, (size + 2) ** 2), np.float32)
         return ReferencePatches(size, cut, sums, sums, np.empty((0, 2, 2)))
-
-    def select(self, keep: BoolArray | IntArray) -> ReferencePatches:
-        """The chosen patches; none are copied where all are wanted."""
-        if keep.dtype == np.bool_ and keep.all():
-            return self
-        return Rows.select(self, keep)
 
     def deformation(self) -> FloatArray:
         """(n,) Frobenius norm of how far each map is from none."""

@@ -55,7 +55,6 @@ class EgoMotionSolver:
         self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
         self._camera = np.array([sensor.fx, sensor.fy, sensor.cx, sensor.cy, sensor.baseline])
-        self._directions = self.floor.basis(np.eye(4))
         self.noise = MatchNoise()
         """Of the measurements; the caller has it learn each frame."""
         self._judges = settings.outlier_sigmas > 0.0 and settings.weighting != "uniform"
@@ -133,14 +132,16 @@ class EgoMotionSolver:
             prior = _prior_information(prediction.covariance)
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
         kernel = ROBUST.index(self._settings.kernel) if robust else 0
-        wTc, hessian, state = start.copy(), np.zeros((6, 6)), np.zeros(2)
+        system, state, predicted = np.zeros((2, 7, 6)), np.zeros(2), prediction.wTc
+        moved = inverse(predicted) @ start
         fit_pose(
-            problem.points, problem.measurement, information, self._camera, prediction.wTc, prior,
-            self._directions, kernel, tolerance, MAX_ITERATIONS, wTc,
-            hessian, state, np.empty((9, 6, 6)),
+            transform_to_camera(predicted, problem.points), problem.measurement, information,
+            self._camera, prior, self.floor.basis(predicted), kernel, tolerance, MAX_ITERATIONS,
+            moved, system, state, np.zeros((7, 6, 6)),
         )  # fmt: skip
+        wTc, hessian = predicted @ moved if state[1] else start, system[0, :6]
         found = bool(state[1]) and self._determined(wTc, hessian)
-        return _Minimum(wTc if state[1] else start, hessian, found, int(state[0]))
+        return _Minimum(wTc, hessian, found, int(state[0]))
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
         """True if the matches (and the prior) determine all degrees of freedom."""

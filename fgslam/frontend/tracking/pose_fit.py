@@ -1,10 +1,11 @@
 """Kernel that fits a pose to matches: damped Gauss-Newton with a robust cost and a prior.
 
-A point (x, y, z) in the camera's frame is predicted at c = (c_x + f_x x/z, c_y + f_y y/z, f_x b/z).
-With r = c - measured, its information W, J = dc / d(tangent of wTc), s = r^T W r, minimised is ::
+The pose T is that in the frame of the predicted camera. Of a point (x, y, z) in the frame of T,
+c = (c_x + f_x x/z, c_y + f_y y/z, f_x b/z) is expected. With r = c - measured, its information W,
+J = dc / d(tangent of T) and s = r^T W r, minimised is ::
 
-    sum rho(s) + |d|^2 in the prior's metric P,    d = Log(predicted^-1 wTc)    (Lowe 1991)
-    H = sum rho'(s) J^T W J + L^T P L              L = dd / d(tangent), Bernoulli's series of ad(d)
+    sum rho(s) + d^T P d,    d = Log(T)        P the prior's information (Lowe 1991)
+    H = sum rho'(s) J^T W J + L^T P L          L = dd / d(tangent), Bernoulli's series of ad(d)
     step = -B (B^T H B, its diagonal times 1 + damping)^-1 B^T gradient
 
 B (6, f) are the directions that the floor allows, turned into the camera's frame. Where a step
@@ -22,7 +23,6 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import (
     in_front,
-    inverse,
     moved_apart,
     point_pose_jacobian,
     project,
@@ -31,14 +31,14 @@ from fgslam.core.geometry import (
     se3_log_jacobian,
     transform_to_camera,
 )
-from fgslam.core.kernels import Kernel
+from fgslam.core.kernels import Kernel, invert
 from fgslam.core.sensors import CameraRig
 
 ROBUST = ("none", "huber", "cauchy")
 _WIDTH = 2.0  # of the robust kernel, standard deviations of a residual
 _MAX_DAMPING = 1e8
-_SMALL_ANGLE = 1e-4  # below it the series are exact to double precision
 _NEAREST_M = 1e-3
+_NO_TURN = 1e-12  # radians: below, the limits of the quotients by it
 
 
 def multiply(a: Any, b: Any, out: Any) -> None:
@@ -50,33 +50,36 @@ def multiply(a: Any, b: Any, out: Any) -> None:
                 out[i, j] += a[i, k] * b[k, j]
 
 
-def square_of(information: Any, r: Any) -> float:
-    """``r^T W r``."""
-    total = 0.0
-    for a in range(len(information)):
-        for b in range(len(information)):
-            total += r[a] * information[a, b] * r[b]
-    return total
-
-
-def add_term(j: Any, information: Any, r: Any, weight: float, room: Any) -> None:
-    """Adds ``J^T W J`` to the hessian, room[0], and ``J^T W r`` to the gradient, room[1, 0]."""
-    for a in range(len(information)):
+def add_term(j: Any, information: Any, r: Any, robust: int, system: Any) -> float:
+    """The robust cost; adds ``J^T W J`` and, in the seventh row, ``J^T W r`` to a system (7, 6)."""
+    square, weight, size = 0.0, 1.0, len(information)
+    for a in range(size):
+        for b in range(size):
+            square += r[a] * information[a, b] * r[b]
+    if robust == 2:
+        weight = 1.0 / (1.0 + square / _WIDTH**2)
+        square = _WIDTH**2 * math.log1p(square / _WIDTH**2)
+    elif robust == 1 and square > _WIDTH**2:
+        weight = _WIDTH / math.sqrt(square)
+        square = _WIDTH * (2.0 * math.sqrt(square) - _WIDTH)
+    for a in range(size):
         for i in range(6):
             pull = 0.0
-            for b in range(len(information)):
+            for b in range(size):
                 pull += weight * information[a, b] * j[b, i]
-            room[1, 0, i] += pull * r[a]
+            system[6, i] += pull * r[a]
             for k in range(6):
-                room[0, i, k] += pull * j[a, k]
+                system[i, k] += pull * j[a, k]
+    return square
 
 
 def add_matches(
-    pose: Any, points: Any, measured: Any, information: Any, camera: Any, robust: int, room: Any
-) -> float:
-    """Cost of the matches, which are added."""
+    pose: Any, points: Any, measured: Any, information: Any, camera: Any, robust: int,
+    system: Any, room: Any,
+) -> float:  # fmt: skip
+    """Cost of the matches, which are added to the system."""
     fx, fy, base, cost = camera[0], camera[1], camera[0] * camera[4], 0.0
-    j, p, r = room[2], room[1, 1], room[1, 2]
+    j, p, r = room[0], room[1, 0], room[1, 1]
     j[:] = 0.0
     for n in range(len(points)):
         for i in range(3):
@@ -90,59 +93,36 @@ def add_matches(
         r[0] = camera[2] + fx * u - measured[n, 0]
         r[1] = camera[3] + fy * v - measured[n, 1]
         r[2] = base * near - measured[n, 2]
-        square = square_of(information[n], r)
-        rho, weight = square, 1.0
-        if robust == 2:
-            weight = 1.0 / (1.0 + square / _WIDTH**2)
-            rho = _WIDTH**2 * math.log1p(square / _WIDTH**2)
-        elif robust == 1 and square > _WIDTH**2:
-            weight = _WIDTH / math.sqrt(square)
-            rho = _WIDTH * (2.0 * math.sqrt(square) - _WIDTH)
-        cost += rho
-        j[0, 0], j[0, 1], j[0, 2], j[0, 3], j[0, 5] = (
-            fx * u * v, -fx * (1.0 + u * u), fx * v, -fx * near, fx * u * near
-        )  # fmt: skip
-        j[1, 0], j[1, 1], j[1, 2], j[1, 4], j[1, 5] = (
-            fy * (1.0 + v * v), -fy * u * v, -fy * u, -fy * near, fy * v * near
-        )  # fmt: skip
+        j[0, 0], j[0, 1], j[0, 2] = fx * u * v, -fx * (1.0 + u * u), fx * v
+        j[1, 0], j[1, 1], j[1, 2] = fy * (1.0 + v * v), -fy * u * v, -fy * u
         j[2, 0], j[2, 1], j[2, 5] = base * v * near, -base * u * near, base * near * near
-        add_term(j, information[n], r, weight, room)
+        j[0, 3], j[0, 5], j[1, 4], j[1, 5] = -fx * near, fx * u * near, -fy * near, fy * v * near
+        cost += add_term(j, information[n], r, robust, system)
     return cost
 
 
-def add_prior(pose: Any, predicted: Any, prior: Any, room: Any) -> float:
-    """Cost of the deviation from the predicted pose, which is added."""
-    ad, ad2, ad4, ad6, d, m = room[2], room[3], room[4], room[5], room[1, 1], room[6]
-    for i in range(3):  # m = predicted^-1 wTc
-        for k in range(4):
-            m[i, k] = 0.0
-            for a in range(3):
-                m[i, k] += predicted[a, i] * (pose[a, k] - (predicted[a, 3] if k == 3 else 0.0))
-    sine, cosine, theta2, along = 0.0, 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1.0), 0.0, 0.0
+def add_prior(pose: Any, prior: Any, system: Any, room: Any) -> float:
+    """Cost of the deviation from the predicted pose, which is added to the system."""
+    ad, ad2, ad4, ad6, d = room[0], room[1], room[2], room[3], room[4, 0]
     for i in range(3):
-        d[i] = 0.5 * (m[(i + 2) % 3, (i + 1) % 3] - m[(i + 1) % 3, (i + 2) % 3])
-        sine += d[i] * d[i]
-    sine = math.sqrt(sine)
-    small = sine < _SMALL_ANGLE and cosine > 0.0
-    ratio = 1.0 + sine * sine / 6.0 if small else math.atan2(sine, cosine) / max(sine, 1e-12)
+        d[i] = 0.5 * (pose[(i + 2) % 3, (i + 1) % 3] - pose[(i + 1) % 3, (i + 2) % 3])
+    sine = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    theta = math.atan2(sine, 0.5 * (pose[0, 0] + pose[1, 1] + pose[2, 2] - 1.0))
+    along, c = 0.0, 1.0 / 12.0
+    if theta > _NO_TURN:
+        c = (1.0 - 0.5 * theta / math.tan(0.5 * theta)) / (theta * theta)
     for i in range(3):
-        d[i] *= ratio
-        theta2 += d[i] * d[i]
-        along += d[i] * m[i, 3]
-    half = 0.5 * math.sqrt(theta2)
-    c = 1.0 / 12.0 + theta2 / 720.0
-    if not small:
-        c = (1.0 - half * math.cos(half) / math.sin(half)) / theta2
+        d[i] *= theta / sine if sine > _NO_TURN else 1.0
+        along += d[i] * pose[i, 3]
     ad[:] = 0.0
+    for i in range(3):  # with w = d[:3] the translation's part is t - w x t / 2 + c w x (w x t)
+        a, b = (i + 1) % 3, (i + 2) % 3
+        twice = d[i] * along - theta * theta * pose[i, 3]
+        d[3 + i] = pose[i, 3] - 0.5 * (d[a] * pose[b, 3] - d[b] * pose[a, 3]) + c * twice
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
-        crossed = d[a] * m[b, 3] - d[b] * m[a, 3]
-        d[3 + i] = m[i, 3] - 0.5 * crossed + c * (d[i] * along - theta2 * m[i, 3])
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        ad[i, a] = ad[3 + i, 3 + a] = -d[b]
-        ad[i, b] = ad[3 + i, 3 + b] = d[a]
-        ad[3 + i, a], ad[3 + i, b] = -d[3 + b], d[3 + a]
+        ad[i, a], ad[i, b], ad[3 + i, a], ad[3 + i, b] = -d[b], d[a], -d[3 + b], d[3 + a]
+        ad[3 + i, 3 + a], ad[3 + i, 3 + b] = -d[b], d[a]
     multiply(ad, ad, ad2)
     multiply(ad2, ad2, ad4)
     multiply(ad4, ad2, ad6)
@@ -150,45 +130,33 @@ def add_prior(pose: Any, predicted: Any, prior: Any, room: Any) -> float:
         for k in range(6):
             ad[i, k] = ad[i, k] / 2 + ad2[i, k] / 12 - ad4[i, k] / 720 + ad6[i, k] / 30240
         ad[i, i] += 1.0
-    add_term(ad, prior, d, 1.0, room)
-    return square_of(prior, d)
+    return add_term(ad, prior, d, 0, system)
 
 
-def solve_step(
-    pose: Any, basis: Any, hessian: Any, gradient: Any, damping: float, room: Any
-) -> Any:
-    """The largest entry of the step, ``room[2, 0]``; infinite where it is not determined."""
-    step, right, b, hb, m = room[2, 0], room[2, 1], room[3], room[4], room[5]
-    free = basis.shape[1]
+def solve_step(pose: Any, basis: Any, system: Any, damping: float, step: Any, room: Any) -> float:
+    """The largest entry of the step; infinite where it is not determined."""
+    b, hb, m, free = room[0], room[1], room[2], basis.shape[1]
     b[:] = 0.0
     for i in range(6):
         for k in range(free):
             for a in range(3):
                 b[i, k] += pose[a, i % 3] * basis[i // 3 * 3 + a, k]
-    multiply(hessian, b, hb)
+    multiply(system, b, hb)
     for i in range(free):
-        right[i] = 0.0
-        for k in range(6):
-            right[i] -= b[k, i] * gradient[k]
         for j in range(free):
             m[i, j] = 0.0
             for k in range(6):
                 m[i, j] += b[k, i] * hb[k, j]
         m[i, i] *= 1.0 + damping
-    for p in range(free):  # Gauss and Jordan: definite, and needs no pivots
-        if not m[p, p] > 0.0:
-            return math.inf
-        for i in range(free):
-            if i != p:
-                factor = m[i, p] / m[p, p]
-                right[i] -= factor * right[p]
-                for j in range(p, free):
-                    m[i, j] -= factor * m[p, j]
+    if not invert(m, free):
+        return math.inf
     largest = 0.0
     for i in range(6):
         step[i] = 0.0
         for k in range(free):
-            step[i] += b[i, k] * right[k] / m[k, k]
+            for j in range(free):
+                for a in range(6):
+                    step[i] -= b[i, k] * m[k, j] * b[a, j] * system[6, a]
         largest = max(largest, abs(step[i]))
     return largest
 
@@ -196,55 +164,48 @@ def solve_step(
 def move(start: Any, step: Any, out: Any) -> None:
     """As :func:`fgslam.core.geometry.moved_apart`."""
     theta2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
-    theta = math.sqrt(theta2)
-    a, b = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0
-    if theta >= _SMALL_ANGLE:
+    theta, a, b = math.sqrt(theta2), 1.0, 0.5
+    if theta > _NO_TURN:
         a, b = math.sin(theta) / theta, 2.0 * math.sin(0.5 * theta) ** 2 / theta2
     for i in range(3):
-        x, y, z = start[i, 0], start[i, 1], start[i, 2]
-        along = b * (x * step[0] + y * step[1] + z * step[2])
-        rest = 1.0 - b * theta2
-        out[i, 0] = rest * x + along * step[0] + a * (y * step[2] - z * step[1])
-        out[i, 1] = rest * y + along * step[1] + a * (z * step[0] - x * step[2])
-        out[i, 2] = rest * z + along * step[2] + a * (x * step[1] - y * step[0])
-        out[i, 3] = start[i, 3] + x * step[3] + y * step[4] + z * step[5]
+        row, along = start[i], b * (start[i, 0] * step[0] + start[i, 1] * step[1])
+        along += b * start[i, 2] * step[2]
+        out[i, 3] = row[3]
+        for k in range(3):
+            p, q = (k + 1) % 3, (k + 2) % 3
+            turned = a * (row[p] * step[q] - row[q] * step[p]) + along * step[k]
+            out[i, k] = (1.0 - b * theta2) * row[k] + turned
+            out[i, 3] += row[k] * step[3 + k]
 
 
 def _fit(  # noqa: PLR0913  kernels take plain arrays
-    points: Any, measured: Any, information: Any, camera: Any, predicted: Any, prior: Any,
-    basis: Any, robust: int, tolerance: float, most: int, pose: Any, hessian: Any, state: Any,
-    room: Any,
+    points: Any, measured: Any, information: Any, camera: Any, prior: Any, basis: Any, robust: int,
+    tolerance: float, most: int, pose: Any, system: Any, state: Any, room: Any,
 ) -> None:  # fmt: skip
-    now, gradient, best_cost, damping = room[7], room[8, 0], math.inf, 0.0
-    for i in range(3):
-        for k in range(4):
-            now[i, k] = pose[i, k]
-    state[0] = 0.0
+    best, tried, now, step, still = system[0], system[1], room[5], room[4, 1], room[6, 0]
+    best_cost, damping = math.inf, 0.0
+    move(pose, still, now)
     while state[0] < most:
         state[0] += 1.0
-        room[0], room[1] = 0.0, 0.0
-        cost = add_matches(now, points, measured, information, camera, robust, room)
+        tried[:] = 0.0
+        cost = add_matches(now, points, measured, information, camera, robust, tried, room)
         if math.isfinite(cost):
-            cost += add_prior(now, predicted, prior, room)
+            cost += add_prior(now, prior, tried, room)
         if cost <= best_cost * (1.0 + 1e-12):
-            for i in range(6):
-                gradient[i] = room[1, 0, i]
+            for i in range(7):
                 for k in range(6):
-                    hessian[i, k] = room[0, i, k]
-            for i in range(3):
-                for k in range(4):
-                    pose[i, k] = now[i, k]
-            best_cost = cost
-            damping *= 0.1
+                    best[i, k] = tried[i, k]
+            move(now, still, pose)
+            best_cost, damping = cost, 0.1 * damping
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > _MAX_DAMPING:
                 break
-        largest = solve_step(pose, basis, hessian, gradient, damping, room)
+        largest = solve_step(pose, basis, best, damping, step, room)
         state[1] = 1.0 if math.isfinite(best_cost) and math.isfinite(largest) else 0.0
         if state[1] == 0.0 or largest < tolerance:
             break
-        move(pose, room[2, 0], now)
+        move(pose, step, now)
 
 
 # ------------------------------------------------------------------------------------------
@@ -278,29 +239,30 @@ def _linearised(
 
 def _fit_numpy(  # noqa: PLR0913
     points: FloatArray, measured: FloatArray, information: FloatArray, camera: FloatArray,
-    predicted: FloatArray, prior: FloatArray, basis: FloatArray, robust: int, tolerance: float,
-    most: int, pose: FloatArray, hessian: FloatArray, state: FloatArray, _: FloatArray,
+    prior: FloatArray, basis: FloatArray, robust: int, tolerance: float, most: int,
+    pose: FloatArray, system: FloatArray, state: FloatArray, _: FloatArray,
 ) -> None:  # fmt: skip
-    now, gradient, best_cost, damping = pose.copy(), np.zeros(6), np.inf, 0.0
+    now, best, best_cost, damping = pose.copy(), system[0], np.inf, 0.0
     for iteration in range(1, most + 1):
         state[0] = iteration
-        cost, h, g = _linearised(now, points, measured, information, camera, robust)
-        deviation = se3_log(inverse(predicted) @ now)
+        cost, hessian, gradient = _linearised(now, points, measured, information, camera, robust)
+        deviation = se3_log(now)
         pull = se3_log_jacobian(deviation).T @ prior
         cost += float(deviation @ prior @ deviation)
         if cost <= best_cost * (1.0 + 1e-12):
-            best_cost, gradient = cost, g + pull @ deviation
-            pose[:], hessian[:] = now, h + pull @ se3_log_jacobian(deviation)
+            pose[:], best_cost = now, cost
+            best[:6] = hessian + pull @ se3_log_jacobian(deviation)
+            best[6] = gradient + pull @ deviation
             damping *= 0.1
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > _MAX_DAMPING:
                 break
         b = np.kron(np.eye(2), pose[:3, :3].T) @ basis
-        reduced = b.T @ hessian @ b
+        reduced = b.T @ best[:6] @ b
         reduced.flat[:: len(reduced) + 1] *= 1.0 + damping
         try:
-            step = -(b @ np.linalg.solve(reduced, b.T @ gradient))
+            step = -(b @ np.linalg.solve(reduced, b.T @ best[6]))
         except np.linalg.LinAlgError:
             step = np.full(6, np.inf)
         largest = np.abs(step).max()
@@ -313,11 +275,11 @@ def _fit_numpy(  # noqa: PLR0913
 fit_pose = Kernel(
     _fit,
     _fit_numpy,
-    "f8[:,::1] f8[:,::1] f8[:,:,::1] f8[::1] f8[:,::1] f8[:,::1] f8[:,::1] i8 f8 i8 "
-    "f8[:,::1] f8[:,::1] f8[::1] f8[:,:,::1]",
-    *(multiply, add_term, square_of, add_matches, add_prior, solve_step, move),
+    "f8[:,::1] f8[:,::1] f8[:,:,::1] f8[::1] f8[:,::1] f8[:,::1] i8 f8 i8 f8[:,::1] f8[:,:,::1] "
+    "f8[::1] f8[:,:,::1]",
+    *(multiply, add_term, add_matches, add_prior, solve_step, move, invert),
 )
-"""(points (k, 3), measured (k, 3), information (k, 3, 3), camera (f_x, f_y, c_x, c_y, b), predicted
-(4, 4), prior (6, 6), directions allowed in the world (6, f), place in :data:`ROBUST`, tolerance,
-most steps, pose, hessian, state, room (9, 6, 6)): the pose (4, 4), from where it starts, and there
-the hessian (6, 6), and the state (2,): steps, and whether the pose is determined."""
+"""(points (k, 3), measured (k, 3), information (k, 3, 3), camera (f_x, f_y, c_x, c_y, b), prior
+(6, 6), directions allowed (6, f), place in :data:`ROBUST`, tolerance, most steps, pose, system,
+state, zeros (7, 6, 6)), all in the frame of the predicted camera: the pose (4, 4), from where it
+starts; hessian and gradient there, system[0] of (2, 7, 6); steps, and whether it is determined."""
