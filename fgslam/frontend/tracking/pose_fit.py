@@ -25,8 +25,6 @@ from fgslam.core.geometry import (
     in_front,
     moved_apart,
     point_pose_jacobian,
-    project,
-    projection_jacobian,
     se3_log,
     se3_log_jacobian,
     transform_to_camera,
@@ -222,8 +220,8 @@ def _linearised(
     local = transform_to_camera(pose, points)
     if not in_front(local).all():
         return np.inf, np.zeros((6, 6)), np.zeros(6)
-    residual = project(rig, local) - measured
-    jacobian = projection_jacobian(rig, local) @ point_pose_jacobian(local)
+    residual = rig.predict(local) - measured
+    jacobian = rig.jacobian(local) @ point_pose_jacobian(local)
     rho = square = np.einsum("ki,kij,kj->k", residual, information, residual)
     weight = np.ones_like(square)
     if robust == ROBUST.index("cauchy"):
