@@ -200,7 +200,7 @@ ESTIMATORS: Mapping[str, type[Any]] = {
 }
 """Settings of the estimators of SLAM by kind."""
 
-DEFAULT_ESTIMATOR = Isam2Settings.kind
+DEFAULT_ESTIMATOR = SlidingWindowSettings.kind
 """Of a recording that comes without a configuration, and of a session; why: the table in
 docs/howto/your_recording.md."""
 

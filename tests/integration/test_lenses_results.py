@@ -11,6 +11,7 @@ from running import metrics_of
 import fgslam as fg
 from benchmarks.evidence import euroc_raw, lenses
 from benchmarks.evidence.lens_views import loaded, raw_cameras
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import se3_exp
 from fgslam.core.types import Trajectory, read_covariances
@@ -92,7 +93,7 @@ def extent_m(positions: FloatArray) -> float:
 def test_a_drone_that_stands_stays_where_it_is(shared_data: Path, tmp_path: Path) -> None:
     """Ten raw pairs over 3 s; the truth's own extent is 2.1 mm. Measured: 1.7 mm, sigma 0.3 mm."""
     root = shared_data / "stereo_raw" / "euroc_V1_01_cut"
-    out = fg.run(root, tmp_path / "run", UNSEEN).folder / "isam2"
+    out = fg.run(root, tmp_path / "run", UNSEEN).folder / DEFAULT_ESTIMATOR
     found = Trajectory.load(out / "final.tum")
     truth = np.loadtxt(root / "groundtruth_tum.txt")
     nearest = np.abs(truth[:, :1] - found.timestamps).argmin(axis=0)
@@ -112,4 +113,4 @@ def test_colour_and_depth_of_a_hand_are_located(shared_data: Path, tmp_path: Pat
     metrics = metrics_of(fg.run(shared_data / "rgbd_fr1", tmp_path / "run", UNSEEN).folder)
     counts = metrics["status_counts"]
     assert sum(counts.get(name, 0) for name in ("first", "ok", "capped", "relocalised")) >= 14
-    assert metrics["estimators"]["isam2"]["ate_rmse_m"] < 0.015
+    assert metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.015

@@ -9,6 +9,7 @@ import pytest
 from running import metrics_of
 
 import fgslam as fg
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 
 SHARE, SEED = 0.05, 0
 
@@ -31,4 +32,4 @@ def test_five_percent_of_single_images_missing_cost_no_accuracy(
     metrics = metrics_of(tmp_path / "run")
     assert metrics["status_counts"]["one_image"] == gone.sum() == 10
     # The complete recording has 1.5 cm; with the whole frames thrown away it were 7.5.
-    assert metrics["estimators"]["isam2"]["ate_rmse_m"] < 0.02
+    assert metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.02

@@ -13,6 +13,7 @@ from running import Capture, Patch, main, metrics_of
 from scipy.spatial.transform import Rotation
 
 import fgslam as fg
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -104,7 +105,7 @@ def test_tum_vi_is_mapped_by_the_bare_command(
     first = said.splitlines()[0]
     assert "EuRoC native, 2 cameras 192x192, unrectified; 8 frames at 20 Hz" in first
     assert "a gyroscope, no odometry; truth, for evaluation only" in first
-    result = metrics_of(tmp_path / "run")["estimators"]["isam2"]
+    result = metrics_of(tmp_path / "run")["estimators"][DEFAULT_ESTIMATOR]
     assert result["ate_rmse_m"] < 0.003  # of 0.28 m
     assert result["ate_first_pose_m"] < 0.006  # 0.018 by a camera that is rolled by 0.6 degrees
     bias = result["gyroscope_bias_dps"]

@@ -72,5 +72,5 @@ def test_a_folder_becomes_a_map_without_open3d(
     loaded = run(tmp_path, *command, PYTHONPROFILEIMPORTTIME="1").stderr
     assert re.search(r"\| +cv2$", loaded, flags=re.MULTILINE)
     assert not re.search(r"\| +(open3d|rerun|distributed)$", loaded, flags=re.MULTILINE)
-    assert (tmp_path / "mapped/isam2/map.ply").is_file()
+    assert (tmp_path / "mapped/sliding_window/map.ply").is_file()
     assert [path.name for path in tmp_path.iterdir()] == ["mapped"]
