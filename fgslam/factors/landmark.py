@@ -52,6 +52,17 @@ class StereoFactors:
         model = self._whitening.model(covariance, FROM_MEASUREMENT)
         return self.with_model(pose, landmark, measurement, model)
 
+    def graph(
+        self, poses: IntArray, landmarks: IntArray, measured: FloatArray, covariances: FloatArray
+    ) -> Any:
+        """Factors of k observations, in their order; arguments as those of :meth:`factor`."""
+        out = gtsam.NonlinearFactorGraph()
+        models = map(self._whitening.model, FROM_MEASUREMENT @ covariances @ FROM_MEASUREMENT.T)
+        keys = poses.tolist(), landmarks.tolist()
+        for pose, landmark, measurement, model in zip(*keys, measured, models, strict=True):
+            out.add(self.with_model(pose, landmark, measurement, model))
+        return out
+
     def with_model(self, pose: int, landmark: int, measurement: FloatArray, model: Any) -> Any:
         """The same with a noise model of (u_left, u_right, v)."""
         column, row, disparity = measurement.tolist()

@@ -230,7 +230,8 @@ class GraphBuilder:
         self.frames.append(tracked.frame)
         self._add_observations(new, tracked, landmarks)
         if self._remember:
-            self._remember_observed(new.sightings)
+            gone = np.zeros(len(new.sightings), np.bool_)
+            self.observed.append(_columns(new.sightings) | {"gone": gone})
         return new
 
     def take_out(self, variable: int) -> str:
@@ -307,17 +308,18 @@ class GraphBuilder:
     def kept_factors(self) -> Any:
         """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
         out = self._other_factors()
-        seen = self.kept_observed()
-        for frame, variable, measurement, covariance in zip(*seen, strict=True):
-            out.add(self._observation(int(variable), Sighting(int(frame), measurement, covariance)))
+        out.push_back(self._observation_factors(*self.kept_observed()))
         return out
 
     def observation_factors(self, sightings: list[tuple[int, Sighting]]) -> Any:
         """Factors of observations of landmark variables, weighed as is known now."""
-        out = gtsam.NonlinearFactorGraph()
-        for variable, sighting in sightings:
-            out.add(self._observation(variable, sighting))
-        return out
+        return self._observation_factors(*_columns(sightings).values())
+
+    def _observation_factors(
+        self, frames: IntArray, variables: IntArray, measured: FloatArray, covariances: FloatArray
+    ) -> Any:
+        keys = pose_key(0) + frames, landmark_key(0) + variables
+        return self._factors.graph(*keys, measured, self._power * covariances)
 
     def whole_graph(
         self, values: Any, kernel: KernelSettings | None = None
@@ -412,15 +414,17 @@ class GraphBuilder:
         rows = landmarks.rows(accepted.ids)
         positions = landmarks.positions[rows]
         known = parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
-        for i, identity in enumerate(accepted.ids.tolist()):
-            sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
+        ids, parallaxes = accepted.ids.tolist(), known.tolist()
+        seen = zip(ids, accepted.measurement, accepted.covariance, strict=True)
+        for i, (identity, measurement, covariance) in enumerate(seen):
+            sighting = Sighting(new.frame, measurement, covariance)
             track = self.admission.sighted(identity, sighting)
             if track.variable >= 0:
                 new.sightings.append((track.variable, sighting))
             else:
                 track.waiting.append(sighting)
-                if self.admission.admits(identity, float(known[i])):
-                    self._enter(new, identity, positions[i], wTc, float(known[i]))
+                if self.admission.admits(identity, parallaxes[i]):
+                    self._enter(new, identity, positions[i], wTc, parallaxes[i])
 
     def _enter(
         self,
@@ -455,32 +459,21 @@ class GraphBuilder:
         else:
             new.priors.append((variable, mean, covariance))
 
-    def _observation(self, variable: int, sighting: Sighting) -> Any:
-        return self._factors.factor(
-            pose_key(sighting.frame),
-            landmark_key(variable),
-            sighting.measurement,
-            self._power * sighting.covariance,
-        )
-
-    def _remember_observed(self, sightings: list[tuple[int, Sighting]]) -> None:
-        if not sightings:
-            return
-        self.observed.append(
-            {
-                "frame": np.array([s.frame for _, s in sightings]),
-                "variable": np.array([variable for variable, _ in sightings]),
-                "measurement": np.array([s.measurement for _, s in sightings]),
-                "covariance": np.array([s.covariance for _, s in sightings]),
-                "gone": np.zeros(len(sightings), np.bool_),
-            }
-        )
-
     def _push(self, new: NewFactors, factor: Any) -> int:
         new.graph.add(factor)
         if self._remember:
             self.graph.add(factor)
         return int(self.graph.size()) - 1
+
+
+def _columns(sightings: list[tuple[int, Sighting]]) -> dict[str, Any]:
+    """Frames (k,), variables (k,), measurements (k, 3) and covariances (k, 3, 3)."""
+    return {
+        "frame": np.array([s.frame for _, s in sightings], np.int64),
+        "variable": np.array([variable for variable, _ in sightings], np.int64),
+        "measurement": np.array([s.measurement for _, s in sightings]).reshape(-1, 3),
+        "covariance": np.array([s.covariance for _, s in sightings]).reshape(-1, 3, 3),
+    }
 
 
 def parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -344,8 +344,8 @@ class SlidingWindowSolver(WholeGraphSolver):
         self.poses.append(new.values.atPose3(pose_key(new.frame)).matrix())
         self.drift.append(self.drift[-1] if self.drift else np.zeros((6, 6)))
         self._sizes.append(np.inf)
-        for variable in range(len(self.held), self.builder.variables):
-            self.held.enter(new.values.atPoint3(landmark_key(variable)))
+        fresh = map(landmark_key, range(len(self.held), self.builder.variables))
+        self.held.enter(np.array([new.values.atPoint3(key) for key in fresh]).reshape(-1, 3))
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Solves the window where the last solution lies `update_every` frames back.

@@ -176,11 +176,11 @@ class HeldLandmarks(GrowingColumns):
             saved=np.empty(0, np.bool_),
         )
 
-    def enter(self, point: FloatArray) -> None:
-        """A new variable, of which nothing is known."""
-        row = {"points": point, "mean": point, "information": np.zeros((3, 3))}
-        last = {"homes": np.array(-1), "saved": np.array(False)}
-        self.append({name: value[None] for name, value in (row | last).items()})
+    def enter(self, points: FloatArray) -> None:
+        """New variables at points (k, 3), of which nothing is known."""
+        k = len(points)
+        known = {"points": points, "mean": points, "information": np.zeros((k, 3, 3))}
+        self.append(known | {"homes": np.full(k, -1), "saved": np.zeros(k, np.bool_)})
 
     def know(self, variable: int, mean: FloatArray, covariance: FloatArray, saved: bool) -> None:
         """What is known of a new variable beforehand, from a ``saved`` map or from this drive."""

@@ -20,7 +20,7 @@ from dataset_builders import (
     write_tum,
 )
 
-from fgslam.backend.settings import Isam2Settings
+from fgslam.backend.settings import SlidingWindowSettings
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.geometry import pose
 from fgslam.datasets.layouts import recognise_layout
@@ -43,7 +43,7 @@ def test_a_recording_without_odometry_runs_by_constant_velocity(tmp_path: Path) 
         name="walk",
         dataset=found.config.dataset,
         odometry=ConstantVelocitySettings(),
-        estimator=Isam2Settings(),
+        estimator=SlidingWindowSettings(),
     )
     assert found.description.startswith(
         "walk: image folder, 2 cameras 32x24; 6 frames at 10 Hz; no odom"

@@ -448,7 +448,7 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
 def test_a_landmark_that_was_another_is_this_drive_s_and_goes_with_it() -> None:
     held, all_of_them = HeldLandmarks(), np.arange(3)
     for k in all_of_them.tolist():
-        held.enter(np.full(3, float(k)))
+        held.enter(np.full((1, 3), float(k)))
         held.know(k, np.full(3, float(k)), np.eye(3), saved=True)
     held.begin(np.array([1]), np.full((1, 3), 7.0))
     assert held.saved.tolist() == [True, False, True]
