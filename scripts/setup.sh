@@ -91,13 +91,13 @@ install_package() {
 # Open3D renders the lab; all else runs without it, so that nothing here is an error.
 provide_system_libraries() {
   local packages
-  packages="$(.venv/bin/python -m fgslam.worlds.open3d_library --packages)" || true
+  packages="$(.venv/bin/python -m fgslam.core.open3d_library --packages)" || true
   if [ -n "$packages" ] && can_apt; then
     say "installing the system libraries that Open3D lacks here: $packages"
     # shellcheck disable=SC2086  # a list of package names
     apt_install $packages || true
   fi
-  .venv/bin/python -m fgslam.worlds.open3d_library >&2 || true
+  .venv/bin/python -m fgslam.core.open3d_library >&2 || true
 }
 
 case "$kind" in

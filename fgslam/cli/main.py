@@ -445,11 +445,20 @@ def export(  # noqa: PLR0913 - each option is a parameter
     estimator: str | None = None,
     valid_only: bool = False,
     colour: bool = False,
+    dense: Path | None = None,
+    mesh: Path | None = None,
+    grid: Path | None = None,
+    voxel: float | None = None,
+    max_range: float | None = None,
+    cameras: int | None = None,
+    every: int = 2,
+    recording: Path | None = None,
     overwrite: bool = False,
 ) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
-    Of a saved map alone it lists what is in it.
+    Of a saved map alone it lists what is in it. --dense, --mesh and --grid match every pixel of the
+    recording's images.
 
     Args:
         run_folder (RUN|MAP): a run folder, or a saved map
@@ -463,8 +472,19 @@ def export(  # noqa: PLR0913 - each option is a parameter
         estimator: which estimator's; default the one that steered
         valid_only: landmarks seen in at least three frames
         colour: --map in the images' colours, with normals
+        dense: all that the images show, as points with colours and sigma, .ply or .pcd
+        mesh: the same as triangles, .ply
+        grid: free, occupied and unknown cells of the floor, Nav2's .yaml with its .pgm
+        voxel (METRES): side of voxels and of the grid's cells; default three pixels at the median
+            depth
+        max_range (--range METRES): farthest depth; default by the cameras' precision
+        cameras: 2 leaves the top camera out
+        every: of the frames every so many are matched densely
+        recording: where the run's recording is now; default where it was, or beside the run
         overwrite: replace an earlier one
     """
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs.dense import DenseSettings
     from fgslam.runs.export import Wanted, export_run
 
     wanted = Wanted(
@@ -477,9 +497,16 @@ def export(  # noqa: PLR0913 - each option is a parameter
         estimator=estimator,
         valid_only=valid_only,
         colour=colour,
+        dense=dense,
+        mesh=mesh,
+        grid=grid,
+        how=DenseSettings(voxel, max_range, cameras, every),
+        recording=recording,
         overwrite=overwrite,
     )
-    for line in export_run(run_folder, wanted):
+    with progress_bar() as progress:
+        lines = export_run(run_folder, wanted, progress)
+    for line in lines:
         typer.echo(line)
 
 

@@ -41,7 +41,6 @@ from fgslam.datasets.bag_topics import (
 from fgslam.datasets.depth import (
     DEPTH_SIGMA_M,
     MILLIMETRES,
-    Depth,
     camera_of_file,
     colour_and_depth_notes,
     depth_images,
@@ -53,6 +52,8 @@ from fgslam.datasets.depth import (
     sample_depths,
 )
 from fgslam.datasets.images import (
+    Depth,
+    DepthLoader,
     bits_held,
     both_views,
     mosaic_note,
@@ -113,6 +114,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     rows, unpaired = pair_stamps(bag.stamps[chosen.right], others, chosen.right)
     places = np.column_stack([bag.places[v][rows[:, k]] for k, v in enumerate(views)])
     right, size, sigma = places[:, 0].tolist(), rig.image_size, None
+    load_depth: DepthLoader | None = None
     unit: tuple[Entry, ...] = ()
     bits, held = bits_held(len(right), lambda k: bag.read(right[k], messages.stored_of))
     bag.bits = bits
@@ -137,7 +139,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         scale, reported = depth_unit(where, seen, of_integers, stated)
         placed = replace(placed, notes=(*placed.notes, *reported))
         unit = (entry_of_depth(scale, reported, stated is not None or not of_integers),)
-        load = depth_images(read, rig, placed.cameras[1])
+        load, load_depth = depth_images(read, rig, placed.cameras[1])
         sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
         unpaired = colour_and_depth_notes(unpaired)
     else:
@@ -164,7 +166,8 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     how = "--topics" if settings.topics else "types and names of topics"
     topics = Entry("images", shown, how, "--topics", not settings.topics)
     ledger = (*recording.ledger, topics, entry_of_pairs(unpaired), *unit)
-    return replace(recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger)
+    recording = replace(recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger)
+    return replace(recording, load_depth=load_depth)
 
 
 # --------------------------------------------------------------------------------------------

@@ -27,6 +27,8 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import (
+    Depth,
+    DepthLoader,
     ImageLoader,
     first_size,
     read_colour_image,
@@ -63,9 +65,6 @@ from fgslam.datasets.times import (
     stamps_of,
 )
 
-Depth: TypeAlias = npt.NDArray[np.float32]
-"""Depths (height, width) in metres; 0, infinite or NaN where unknown."""
-
 ReadPair: TypeAlias = Callable[[int], tuple[Image, Depth, str]]
 """Of a frame its image, the depth of each pixel in metres, and the name of the depth image."""
 
@@ -92,8 +91,12 @@ def depth_sigma_px(focal_px: float, sigma_m: float) -> float:
     return round(float(np.hypot(focal_px * BASELINE_M * sigma_m, _FOUND_AGAIN_PX)), 3)
 
 
-def depth_images(read: ReadPair, rig: CameraRig, camera: RawCamera) -> ImageLoader:
+def depth_images(
+    read: ReadPair, rig: CameraRig, camera: RawCamera
+) -> tuple[ImageLoader, DepthLoader]:
     """Frames as a stereo pair: the colour camera on the right, the view made by depth left.
+
+    And the depth itself.
 
     Args:
         read: what gives image and depth.
@@ -105,7 +108,7 @@ def depth_images(read: ReadPair, rig: CameraRig, camera: RawCamera) -> ImageLoad
         view = View(camera.matrix, (camera.width, camera.height))
         maps = sampling_maps(camera, np.eye(3), view, pixel_grid(view.size))
 
-    def load(index: int, colour: bool) -> tuple[Image, ...]:
+    def registered(index: int) -> tuple[Image, Depth]:
         image, metres, name = read(index)
         if metres.shape != image.shape[:2]:
             raise FrameError(
@@ -116,6 +119,10 @@ def depth_images(read: ReadPair, rig: CameraRig, camera: RawCamera) -> ImageLoad
             image = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
             # Between two surfaces there is no depth: of each pixel the nearest.
             metres = np.asarray(cv2.remap(metres, *maps, cv2.INTER_NEAREST), np.float32)
+        return image, metres
+
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        image, metres = registered(index)
         known = np.isfinite(metres) & (metres > 0.0)
         shift = rig.fx * rig.baseline / np.where(known, metres, np.inf)
         pair = (image, seen_from_the_left(image, shift.astype(np.float32), known))
@@ -123,7 +130,7 @@ def depth_images(read: ReadPair, rig: CameraRig, camera: RawCamera) -> ImageLoad
             return pair
         return tuple(np.asarray(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), np.uint8) for i in pair)
 
-    return load
+    return load, lambda index: registered(index)[1]
 
 
 _CRACK_PX = 3.0  # between two neighbours on one surface, in the original image
@@ -199,7 +206,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         depth = read_depth_image(depth_file)
         return colour, depth.astype(np.float32) / np.float32(scale), str(depth_file)
 
-    images = depth_images(read, rig, camera)
+    images, depth = depth_images(read, rig, camera)
     files = [*lists, *wheels], (path for pair in pairs for path in pair)
     notes = (*notes, *known, *reported, *mounting)
     name, truth = root.resolve().name, root / "groundtruth.txt"
@@ -214,6 +221,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         entry_of_pairs(notes),
     )
     recording = replace(recording, disparity_sigma_px=sigma, truth_frame="right", ledger=ledger)
+    recording = replace(recording, load_depth=depth)
     if not truth.is_file():
         return recording
     return with_truth(recording, read_tum(truth), truth, stamps)

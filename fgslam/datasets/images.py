@@ -23,6 +23,12 @@ ImageLoader: TypeAlias = Callable[[int, bool], tuple[Image, ...]]
 """Images (right, left[, top]) of one of the recording's own frames, grey or, where the flag is set,
 in red, green, blue if it has colour; raises FrameError."""
 
+Depth: TypeAlias = npt.NDArray[np.float32]
+"""Depths (height, width) in metres; 0, infinite or NaN where unknown."""
+
+DepthLoader: TypeAlias = Callable[[int], Depth]
+"""Of one of the recording's own frames the depth of the reference image; raises FrameError."""
+
 
 # ------------------------------------------------------------------------------------------
 # Files of frames

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import body_is_camera
+from fgslam.datasets.images import Depth, DepthLoader
 from fgslam.datasets.ledger import Entry
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
@@ -163,6 +165,9 @@ def smaller(recording: Recording, scale: float) -> Recording:
             for image in recording.load_images(index, colour)
         )
 
+    def resized(read: DepthLoader, index: int) -> Depth:
+        return np.asarray(cv2.resize(read(index), size, interpolation=cv2.INTER_NEAREST))
+
     return replace(
         recording,
         rig=replace(
@@ -179,6 +184,7 @@ def smaller(recording: Recording, scale: float) -> Recording:
             scale * cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in margins
         ),
         load_images=load,
+        load_depth=recording.load_depth and partial(resized, recording.load_depth),
         notes=(
             f"images of {rig.width}x{rig.height} are made {size[0]}x{size[1]}",
             *recording.notes,

@@ -33,19 +33,19 @@ _INT32_MAX = 2**31 - 1
 _PLY_TYPES = {"f8": "double", "f4": "float", "i4": "int", "u1": "uchar"}
 _PLY_FORMAT = "format binary_little_endian 1.0"
 _PLY_COMMENTS = (
-    "comment fgslam landmark map 1",
-    "comment world = first reference camera: {}, metres",
-    "comment cxx .. czz: covariance of the position in the world, metres squared",
+    "fgslam landmark map 1",
+    "world = first reference camera: {}, metres",
+    "cxx .. czz: covariance of the position in the world, metres squared",
 )
 
 
 Axes: TypeAlias = Literal["camera", "ros"]
-_AXES: dict[Axes, str] = {
+AXES: dict[Axes, str] = {
     "camera": "x right, y down, z forward",
     "ros": "x forward, y left, z up",  # REP 103
 }
 """Of the world and of cameras."""
-_ROS_FROM_CAMERA = BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
+ROS_FROM_CAMERA = BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +101,12 @@ def write_map(path: Path, points: MapPoints, remark: str = "", axes: Axes = "cam
             f"cannot write {path}: unknown map format '{path.suffix}'; use .ply or .pcd"
         )
     if axes == "ros":
-        positions, normals = points.positions @ _ROS_FROM_CAMERA.T, points.normals
+        positions, normals = points.positions @ ROS_FROM_CAMERA.T, points.normals
         points = replace(
             points,
             positions=positions,
-            covariances=rotate_covariances(_ROS_FROM_CAMERA, points.covariances),
-            normals=None if normals is None else normals @ _ROS_FROM_CAMERA.T,
+            covariances=rotate_covariances(ROS_FROM_CAMERA, points.covariances),
+            normals=None if normals is None else normals @ ROS_FROM_CAMERA.T,
         )
     writer(path, points, remark, axes)
 
@@ -116,10 +116,17 @@ def write_ply(path: Path, points: MapPoints, remark: str = "", axes: Axes = "cam
     _require_finite(path, positions=points.positions, covariances=points.covariances)
     columns = dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
     records = _records(path, points, _ply_type(points.normals is not None), columns)
-    lines = ["ply", _PLY_FORMAT, *(line.format(_AXES[axes]) for line in _PLY_COMMENTS)]
-    lines += [f"comment {remark}"] if remark else []
-    lines += [f"element vertex {len(points)}", *_ply_properties(records.dtype), "end_header\n"]
-    write_bytes(path, "\n".join(lines).encode("ascii") + records.tobytes())
+    comments = [line.format(AXES[axes]) for line in _PLY_COMMENTS]
+    write_bytes(path, ply_bytes([*comments, remark], vertex=records))
+
+
+def ply_bytes(comments: Iterable[str], **elements: npt.NDArray[np.void]) -> bytes:
+    """A binary little-endian .ply; a property of several values is a list, its length before it."""
+    lines = ["ply", _PLY_FORMAT, *(f"comment {text}" for text in comments if text)]
+    for name, records in elements.items():
+        lines += [f"element {name} {len(records)}", *_ply_properties(records.dtype)]
+    content = b"".join(records.tobytes() for records in elements.values())
+    return "\n".join([*lines, "end_header\n"]).encode("ascii") + content
 
 
 def _ply_type(has_normals: bool) -> np.dtype[Any]:
@@ -127,8 +134,14 @@ def _ply_type(has_normals: bool) -> np.dtype[Any]:
 
 
 def _ply_properties(dtype: np.dtype[Any]) -> list[str]:
-    names = dtype.names or ()
-    return [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in names]
+    lines: list[str] = []
+    for name in dtype.names or ():
+        kind = _PLY_TYPES[dtype[name].base.str[1:]]
+        if dtype[name].shape:  # the property before it is its length
+            lines[-1] = f"property list uchar {kind} {name}"
+        else:
+            lines.append(f"property {kind} {name}")
+    return lines
 
 
 def read_ply(path: Path) -> MapPoints:
@@ -193,23 +206,28 @@ def write_pcd(path: Path, points: MapPoints, remark: str = "", axes: Axes = "cam
     dtype = _landmark_type("f4", "u4", ("rgb",), "u4", normals)
     red, green, blue = points.colours.astype(np.uint32).T
     records = _records(path, points, dtype, {"rgb": (red << 16) | (green << 8) | blue})
+    write_bytes(path, pcd_bytes([remark, f"axes of the world: {AXES[axes]}"], records))
+
+
+def pcd_bytes(comments: Iterable[str], records: npt.NDArray[np.void]) -> bytes:
+    """A binary .pcd 0.7 of these fields."""
+    dtype = records.dtype
     kinds = [dtype[name] for name in dtype.names or ()]
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
-        *([f"# {remark}"] if remark else []),
-        f"# axes of the world: {_AXES[axes]}",
+        *(f"# {text}" for text in comments if text),
         "VERSION 0.7",
         f"FIELDS {' '.join(dtype.names or ())}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
         f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
         f"COUNT {' '.join('1' for _ in kinds)}",
-        f"WIDTH {len(points)}",
+        f"WIDTH {len(records)}",
         "HEIGHT 1",
         "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(points)}",
+        f"POINTS {len(records)}",
         "DATA binary\n",
     ]
-    write_bytes(path, "\n".join(lines).encode("ascii") + records.tobytes())
+    return "\n".join(lines).encode("ascii") + records.tobytes()
 
 
 def _landmark_type(
@@ -487,16 +505,16 @@ def write_trajectory(
         write_mcap(path, trajectory, covariances)
         return
     if axes == "ros":
-        turned = pose(_ROS_FROM_CAMERA, np.zeros(3)) @ trajectory.poses
+        turned = pose(ROS_FROM_CAMERA, np.zeros(3)) @ trajectory.poses
         turned[:, :3, :3] @= _own_axes(trajectory).T
         trajectory = replace(trajectory, poses=turned)
-        remark = ", ".join(filter(None, (remark, f"axes of REP 103: {_AXES[axes]}")))
+        remark = ", ".join(filter(None, (remark, f"axes of REP 103: {AXES[axes]}")))
     trajectory.save(path, remark)
 
 
 def _own_axes(trajectory: Trajectory) -> FloatArray:
     """(3, 3) from the axes of what moves to those that it has in ROS."""
-    return np.eye(3) if trajectory.frame == "body" else _ROS_FROM_CAMERA
+    return np.eye(3) if trajectory.frame == "body" else ROS_FROM_CAMERA
 
 
 def write_mcap(path: Path, trajectory: Trajectory, covariances: FloatArray | None) -> None:
@@ -538,7 +556,7 @@ def pose_message(
     stamp: int,
     wTc: FloatArray,
     covariance: FloatArray,
-    own_axes: FloatArray = _ROS_FROM_CAMERA,
+    own_axes: FloatArray = ROS_FROM_CAMERA,
 ) -> Any:
     """A PoseWithCovarianceStamped, as :func:`write_mcap` writes it.
 
@@ -551,12 +569,12 @@ def pose_message(
     """
     covariance = np.nan_to_num(covariance)
     seconds, nanoseconds = divmod(stamp, 1_000_000_000)
-    turned = _ROS_FROM_CAMERA @ wTc[:3, :3]
+    turned = ROS_FROM_CAMERA @ wTc[:3, :3]
     x, y, z, w = quaternion_from_rotation(turned @ own_axes.T).tolist()
     to_world = np.zeros((6, 6))  # [translation, rotation] about the world's axes
     to_world[:3, 3:] = to_world[3:, :3] = turned
     time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    x_ahead, y_left, z_up = (_ROS_FROM_CAMERA @ wTc[:3, 3]).tolist()
+    x_ahead, y_left, z_up = (ROS_FROM_CAMERA @ wTc[:3, 3]).tolist()
     point = types["geometry_msgs/msg/Point"](x=x_ahead, y=y_left, z=z_up)
     quaternion = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
     pose = types["geometry_msgs/msg/PoseWithCovariance"](

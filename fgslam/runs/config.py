@@ -749,23 +749,31 @@ def load_experiment(path: Path, overrides: Iterable[str] = ()) -> Experiment:
     Raises:
         ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
     """
-    return make_experiment(_from_anywhere(read_mapping(path)), str(path), overrides)
+    return make_experiment(_from_anywhere(read_mapping(path), path), str(path), overrides)
 
 
 _FILES = ("path", "camera_file", "file")
 
 
-def _from_anywhere(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with files of the data that are not here where the run was started, if there."""
+def _from_anywhere(values: dict[str, Any], where: Path) -> dict[str, Any]:
+    """The values with files of the data that are not here where the run was started, if there.
+
+    Else above the run's own folder, as where both were moved.
+    """
     dataset, known = values.get("dataset"), values.get("provenance")
     started = known.get("directory") if isinstance(known, dict) else None
     if not isinstance(dataset, dict) or not isinstance(started, str):
         return values
-    moved = {}
+    moved: dict[str, str] = {}
     for key in _FILES:
         given = dataset.get(key)
-        if isinstance(given, str) and not Path(given).exists() and (Path(started) / given).exists():
-            moved[key] = str(Path(started) / given)
+        if not isinstance(given, str) or Path(given).exists():
+            continue
+        names = (given, Path(given).name)
+        places = [place / name for place in where.resolve().parents[1:] for name in names]
+        found = [place for place in (Path(started) / given, *places) if place.exists()]
+        if found:
+            moved[key] = str(found[0])
     return {**values, "dataset": {**dataset, **moved}}
 
 
@@ -798,7 +806,7 @@ def make_experiment(
 
 def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
     """Reads an experiment of SLAM. Raises ConfigError, also where it is of another task."""
-    return make_config(_from_anywhere(read_mapping(path)), str(path), overrides)
+    return make_config(_from_anywhere(read_mapping(path), path), str(path), overrides)
 
 
 def make_config(

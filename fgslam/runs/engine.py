@@ -40,6 +40,7 @@ from fgslam.runs.workers import Argument, Executor, Failed, Pool, Result
 if TYPE_CHECKING:
     from fgslam.core.log import ImageSequence, MeasurementRecording
     from fgslam.datasets.omni import OmniRecording
+    from fgslam.runs.dense import DenseMap
 
 _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, next to the data set's identity."""
@@ -118,6 +119,23 @@ class RunResult:
     def metrics(self) -> dict[str, Any]:
         """The document of metrics.json. Raises DatasetError where there is none."""
         return read_metrics(self.folder / METRICS_FILE)
+
+    def dense_map(self, estimator: str | None = None, **how: Any) -> DenseMap:
+        """All that the images of a run of SLAM show: ``surface``, and ``grid`` to drive by.
+
+        Args:
+            estimator: whose trajectory; None for the one that steered.
+            how: ``voxel_m``, ``range_m``, ``cameras``, ``every``; for their defaults see
+                :class:`fgslam.runs.dense.DenseSettings`.
+
+        Raises:
+            FgslamError: no run of SLAM, its recording is gone or has no images, or they show no
+                depth.
+        """
+        from fgslam.runs.dense import DenseSettings  # these load OpenCV and much of SciPy
+        from fgslam.runs.export import dense_map
+
+        return dense_map(self.folder, estimator, DenseSettings(**how))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

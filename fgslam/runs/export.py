@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
-from fgslam.core.errors import ConfigError, DatasetError, FrameError
+from fgslam.core.errors import ConfigError, DatasetError, FrameError, OutputError
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
 from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
@@ -25,10 +25,12 @@ from fgslam.core.sensors import (
     vertical_to_horizontal,
 )
 from fgslam.core.types import Estimate, Trajectory, read_covariances
-from fgslam.datasets.images import encoded_png
+from fgslam.datasets.images import Depth, encoded_png
+from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.content import read_metrics
+from fgslam.report.dense import FREE, OCCUPIED, require_cloud_suffix
 from fgslam.report.formats import (
     MCAP_SUFFIX,
     Axes,
@@ -44,9 +46,11 @@ from fgslam.report.formats import (
 )
 from fgslam.report.results import NO_LANDMARKS
 from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
+from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
+from fgslam.runs.units import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,11 @@ class Wanted:
         estimator: whose; None for the one that steered.
         valid_only: only landmarks that were seen often enough to be trusted.
         colour: the map in the images' colours, with normals.
+        dense: surface of all that the images show, as points, `.ply` or `.pcd`.
+        mesh: the same as triangles, `.ply`.
+        grid: Nav2's `.yaml`, its `.pgm` beside it.
+        how: the dense map is made.
+        recording: where the run's recording is now, None: where it was, or beside the run.
         overwrite: replace files that are there.
     """
 
@@ -76,7 +85,24 @@ class Wanted:
     estimator: str | None = None
     valid_only: bool = False
     colour: bool = False
+    dense: Path | None = None
+    mesh: Path | None = None
+    grid: Path | None = None
+    how: DenseSettings = field(default_factory=DenseSettings)
+    recording: Path | None = None
     overwrite: bool = False
+
+    @property
+    def files(self) -> list[Path]:
+        """Those to write."""
+        grid = (self.grid, self.grid and self.grid.with_suffix(".pgm"))
+        files = (self.map, self.trajectory, self.graph, self.dense, self.mesh, *grid)
+        return [path for path in files if path is not None]
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether images are to be matched densely."""
+        return (self.dense, self.mesh, self.grid) != (None, None, None)
 
     @property
     def is_bag(self) -> bool:
@@ -89,7 +115,9 @@ class Wanted:
         return self.axes or ("ros" if self.is_bag else "camera")
 
 
-def export_run(run: Path, wanted: Wanted) -> list[str]:
+def export_run(
+    run: Path, wanted: Wanted, progress: Progress = lambda what, done, total: None
+) -> list[str]:
     """Writes what was asked for; returns a line about each file.
 
     Of a saved map in place of a run, it describes the map where nothing is asked for.
@@ -97,22 +125,14 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
-    if wanted.is_bag and wanted.axes == "camera":
-        raise ConfigError(
-            f"--axes camera: {wanted.trajectory} is for ROS, whose axes are those of REP 103; "
-            "leave --axes out, or give a .tum"
-        )
-    inputs = sources_of(run)
-    for path in filter(None, (wanted.map, wanted.trajectory, wanted.graph)):
-        require_output(path, wanted.overwrite, inputs)
-    if wanted.images is not None:
-        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
-    asked = any((wanted.map, wanted.trajectory, wanted.graph, wanted.images))
+    _require_outputs(run, wanted)
+    asked = bool(wanted.files or wanted.images)
     folder: Path | None = None  # of an estimator
     log = cache(lambda: MeasurementLog.load(log_of(run)))
     rig: Callable[[], CameraRig]
     if run.is_file():
-        if wanted.colour or (wanted.graph, wanted.images, wanted.estimator) != (None, None, None):
+        others = wanted.graph, wanted.images, wanted.estimator, wanted.recording
+        if wanted.colour or wanted.is_dense or any(others):
             raise ConfigError(
                 f"{run}: a saved map has landmarks and a trajectory, no other estimators, graph or "
                 "images; give --map or --trajectory, or a run folder"
@@ -127,11 +147,9 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         folder = run / results_folder(run, wanted.estimator)
         if not asked:
             raise ConfigError(
-                "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o "
-                "or --images FOLDER"
+                "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o, "
+                "--images FOLDER, --dense FILE.ply, --mesh FILE.ply or --grid FILE.yaml"
             )
-        if wanted.graph is not None:
-            require_graph_suffix(wanted.graph)  # now, not after seconds of reading
         remark = read_metrics(run / "metrics.json").get("remark") or ""
         trajectory = Trajectory.load(folder / "final.tum")
         read, rig = partial(read_ply, folder / "map.ply"), lambda: log().rig
@@ -140,6 +158,9 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         saved_as = _save(wanted.trajectory, wanted, trajectory, folder, rig, remark)
         bare = folder is not None and wanted.trajectory.suffix.lower() == ".kitti"
         lines.append(saved_as + (line_numbers(trajectory, log()) if bare else ""))
+    if wanted.is_dense:
+        found = dense_map(run, wanted.estimator, wanted.how, wanted.recording, progress)
+        lines += save_dense(found, wanted, remark)
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines
     points = read()
@@ -149,12 +170,88 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
     points = points.select(points.valid) if wanted.valid_only else points
     if wanted.colour or wanted.images:
-        config = load_config(run / RUN_MARKER)
+        config = config_of(run, wanted.recording)
         points, line = export_images(wanted.images, config, log(), trajectory, points)
         lines += [line] if line else []
     if wanted.map is not None:
         write_map(wanted.map, points, remark, wanted.chosen_axes)
         lines.append(f"{wanted.map}: {len(points)} landmarks")
+    return lines
+
+
+def config_of(run: Path, recording: Path | None) -> ExperimentConfig:
+    """A run's configuration, its recording where it is now. Raises FgslamError."""
+    moved = [] if recording is None else [f"dataset.path={json.dumps(str(recording.resolve()))}"]
+    return load_config(run / RUN_MARKER, moved)
+
+
+def dense_map(
+    run: Path,
+    estimator: str | None = None,
+    how: DenseSettings | None = None,
+    recording: Path | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> DenseMap:
+    """The dense map of a run, from its recording's images.
+
+    Raises:
+        FgslamError: no run of SLAM, its recording is gone or has no images, or they show no depth.
+    """
+    folder, log = run / results_folder(run, estimator), MeasurementLog.load(log_of(run))
+    trajectory = Trajectory.load(folder / "final.tum")
+    covariances = read_covariances(folder / "covariance.csv")[1]
+    estimate = Estimate(trajectory, covariances, NO_LANDMARKS).of("right", log.rig)
+    rows, pictures, depths = frames_of(config_of(run, recording), estimate.trajectory)
+    return fuse(log, estimate, rows.tolist(), pictures, depths, how, progress)
+
+
+def _require_outputs(run: Path, wanted: Wanted) -> None:
+    """Refuses now, not after seconds of reading, what cannot be written. Raises FgslamError."""
+    if wanted.is_bag and wanted.axes == "camera":
+        raise ConfigError(
+            f"--axes camera: {wanted.trajectory} is for ROS, whose axes are those of REP 103; "
+            "leave --axes out, or give a .tum"
+        )
+    inputs = (*sources_of(run), *([wanted.recording] if wanted.recording else []))
+    for path in wanted.files:
+        require_output(path, wanted.overwrite, inputs)
+    if wanted.images is not None:
+        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
+    if wanted.graph is not None and not run.is_file():
+        require_graph_suffix(wanted.graph)
+    if wanted.dense is not None:
+        require_cloud_suffix(wanted.dense)
+    if wanted.mesh is not None:
+        require_cloud_suffix(wanted.mesh, triangles=True)
+    if wanted.grid is not None and wanted.grid.suffix.lower() not in (".yaml", ".yml"):
+        raise OutputError(
+            f"cannot write {wanted.grid}: a grid is a .yaml with a .pgm beside it; give a name.yaml"
+        )
+
+
+def save_dense(found: DenseMap, wanted: Wanted, remark: str) -> list[str]:
+    """Writes a dense map's files; a line about each. Raises OutputError."""
+    surface, lines = found.surface, []
+    median = 100.0 * float(np.median(surface.sigmas))
+    about = (
+        f"of {found.frames} frames, voxels of {100.0 * found.voxel_m:.3g} cm, seen within "
+        f"{found.range_m:.3g} m, median deviation {median:.2g} cm"
+    )
+    for path, triangles in ((wanted.dense, False), (wanted.mesh, True)):
+        if path is not None:
+            surface.save(path, triangles, wanted.chosen_axes, remark)
+            faces = f" in {len(surface.triangles)} triangles" if triangles else ""
+            lines.append(f"{path}: {len(surface.positions)} points{faces}, {about}")
+    if wanted.grid is not None:
+        grid = found.grid
+        grid.save(wanted.grid)
+        shares = [100.0 * float((grid.cells == value).mean()) for value in (FREE, OCCUPIED)]
+        tilt = f"; tilted by {grid.tilt_deg:.0f} deg against the map" if grid.tilt_deg > 1 else ""
+        lines.append(
+            f"{wanted.grid}: {grid.cells.shape[1]} x {grid.cells.shape[0]} cells of "
+            f"{100.0 * grid.resolution_m:.3g} cm, {shares[0]:.0f} % free, {shares[1]:.0f} % "
+            f"occupied{tilt}"
+        )
     return lines
 
 
@@ -368,9 +465,6 @@ def build_graph(
 # --------------------------------------------------------------------------------------------
 # A run as images with poses and points, and its map in their colours
 
-Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
-"""Images (right, left[, top]) of a selected frame, grey or in red, green, blue."""
-
 _NEIGHBOURS = 12  # through which a plane is laid: three would fit any plane, many round off edges
 
 
@@ -393,7 +487,7 @@ def export_images(
     Raises:
         FgslamError: the run has no images, its recording is gone, or a file cannot be written.
     """
-    rows, pictures = frames_of(config, trajectory)
+    rows, pictures, _ = frames_of(config, trajectory)
     model = build_model(log, trajectory, points)
     tints, missing = Tints(len(model.ids)), 0
     for k, row in enumerate(rows.tolist()):
@@ -476,28 +570,36 @@ def rows_of_frames(log: MeasurementLog, trajectory: Trajectory) -> IntArray:
     return np.array([row_of.get(round(s.timestamp, 9), -1) for s in log], np.int64)
 
 
-def frames_of(config: ExperimentConfig, trajectory: Trajectory) -> tuple[IntArray, Pictures]:
-    """Frame of the recording for each pose, and its images.
+def frames_of(
+    config: ExperimentConfig, trajectory: Trajectory
+) -> tuple[IntArray, Pictures, Callable[[int], Depth] | None]:
+    """Frame of the recording for each pose, its images, and its depth where a camera gives it.
 
     Raises:
         FgslamError: the run has no images, or its recording is gone or another one.
     """
-    dataset = config.dataset
+    dataset, depths = config.dataset, None
     if isinstance(dataset, MeasurementDatasetSettings):
         raise DatasetError(f"a recording of kind {dataset.kind} has no images to export")
     if isinstance(dataset, RenderedLabSettings):
         sequence = open_sequence(config)
         stamps, pictures = sequence.timestamps, lambda i: sequence.frame(i).images
     else:
+        if not is_recording(Path(dataset.path)):
+            raise DatasetError(
+                f"{dataset.path}: the run's recording is not there any more; say where it is now: "
+                "--recording PATH"
+            )
         recording = open_recording(dataset)
         stamps, pictures = recording.timestamps, recording.colour
+        depths = recording.depth if recording.load_depth else None
     rows = np.searchsorted(stamps, trajectory.timestamps - 1e-9)
     if (rows >= len(stamps)).any() or np.abs(stamps[rows] - trajectory.timestamps).max() > 1e-6:
         raise DatasetError(
             f"the recording {dataset.path if hasattr(dataset, 'path') else dataset.kind} has other "
             "times than the run; give the run's own recording"
         )
-    return rows, pictures
+    return rows, pictures, depths
 
 
 class Tints:

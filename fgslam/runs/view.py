@@ -144,7 +144,7 @@ def _film_of_slam(run: Path, estimator: str | None) -> tuple[FloatArray, Iterato
     folder = run / results_folder(run, estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
     log, data = MeasurementLog.load(log_of(run)), load_report(run)
-    frame_at, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
+    frame_at, pictures, _ = frames_of(load_config(run / RUN_MARKER), trajectory)
     plane = level_axes(data.up)[:2]
     above = points.positions @ plane.T
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ plane.T

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.worlds.open3d_library import load_open3d
+from fgslam.core.open3d_library import load_open3d
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -63,7 +63,7 @@ def a_map(n: int = 200, seed: int = 1) -> MapPoints:
 @pytest.fixture(scope="module")
 def open3d():
     try:
-        from fgslam.worlds.open3d_library import load_open3d
+        from fgslam.core.open3d_library import load_open3d
     except ImportError:
         return pytest.importorskip("open3d", exc_type=ImportError, reason="Open3D cannot be loaded")
     from fgslam.core.errors import MissingDependencyError

@@ -2,7 +2,7 @@
 
 Open3D's wheel links against libusb, OpenGL, X11 and others even where only its ray caster is
 used. libusb also lives on PyPI, so its absence is handled here; for the others a message names
-what to install. ``make setup`` runs this module: ``python -m fgslam.worlds.open3d_library`` prints
+what to install. ``make setup`` runs this module: ``python -m fgslam.core.open3d_library`` prints
 in one line what is missing and how to provide it, and ``--packages`` prints the Debian package
 names alone.
 """

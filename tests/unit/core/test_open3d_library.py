@@ -12,8 +12,8 @@ from types import ModuleType
 import pytest
 
 from fgslam.core.errors import MemoryShortageError, MissingDependencyError
-from fgslam.worlds import open3d_library
-from fgslam.worlds.open3d_library import (
+from fgslam.core import open3d_library
+from fgslam.core.open3d_library import (
     DEBIAN_PACKAGES,
     explain_missing_library,
     find_bundled_libusb,

@@ -1,0 +1,250 @@
+"""A dense map of a run: depth of its images, fused along its trajectory, as surface and grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.correction import EXPECTED_PX, FIELD_PX, SHARED, shared_information
+from fgslam.core.errors import ConfigError, DatasetError, FrameError
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.core.types import Estimate
+from fgslam.datasets.depth import DEPTH_SIGMA_M
+from fgslam.datasets.images import Depth
+from fgslam.frontend.dense import MIN_DISPARITY_PX, DenseStereo
+from fgslam.report.dense import (
+    KEPT_SIGMA_VOXELS,
+    TRUNCATION_VOXELS,
+    ColumnScan,
+    DepthFrame,
+    Float32,
+    Fusion,
+    Grid,
+    Surface,
+    find_floor,
+    make_grid,
+    scan_columns,
+)
+from fgslam.runs.units import Progress
+
+Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
+"""Images (right, left[, top]) of a selected frame, grey or in red, green, blue; or FrameError."""
+
+_Read = TypeVar("_Read")
+
+_VOXEL_PX = 3.0  # of the image, at the median depth
+_TYPICAL_PX = 0.1  # deviation of a disparity, which bounds how far it is worth to look
+_SAMPLES = 12  # frames from which steps of disparity and the median depth are learnt
+_LENGTH = SHARED.index("baseline")
+_LEVEL = np.cos(np.deg2rad(2.5))
+_CUT_VOXELS = 2.0 * TRUNCATION_VOXELS  # deviation of a depth beyond which it says nothing
+
+
+@dataclass(frozen=True, slots=True)
+class DenseSettings:
+    """How a dense map is made.
+
+    Attributes:
+        voxel_m: side of a voxel and of the grid's cells; None: three pixels at the median depth.
+        range_m: farthest depth; None: where four pixels of disparity are, or a deviation of a tenth
+            of a pixel is four voxels.
+        cameras: 2 leaves the top camera out.
+        every: of the frames that have a pose, every so many are used.
+    """
+
+    voxel_m: float | None = None
+    range_m: float | None = None
+    cameras: int | None = None
+    every: int = 2
+
+    def __post_init__(self) -> None:
+        for name, value in (("voxel", self.voxel_m), ("range", self.range_m)):
+            if value is not None and not 0.0 < value < np.inf:
+                raise ConfigError(f"--{name} is {value:g}; give metres above 0, or leave it out")
+        if self.cameras not in (None, 2, 3):
+            raise ConfigError(
+                f"--cameras is {self.cameras}; a rig has 2 or 3, leave it out for all"
+            )
+        if self.every < 1:
+            raise ConfigError(f"--every is {self.every}; give 1 for all frames, 2 for every second")
+
+
+@dataclass(frozen=True, eq=False)
+class DenseMap:
+    """A run's surface, and what its grid is made from.
+
+    Attributes:
+        surface: vertices, triangles, colours, deviations.
+        voxel_m: side of a voxel, and of the grid's cells.
+        range_m: farthest depth that was used.
+        frames: how many depth images were fused.
+        scans: of each, what the grid is made from.
+        up: (3,) mean upward direction of the body or the camera, in the map.
+        level: whether it is that of a body that keeps to it, as on wheels.
+    """
+
+    surface: Surface
+    voxel_m: float
+    range_m: float
+    frames: int
+    scans: tuple[ColumnScan, ...]
+    up: FloatArray
+    level: bool
+
+    @cached_property
+    def grid(self) -> Grid:
+        """Free, occupied and unknown cells of the floor."""
+        up, floor = find_floor(self.surface, self.up, self.level, 2.0 * self.voxel_m)
+        return make_grid(self.surface, self.scans, up, floor, self.voxel_m)
+
+
+Measured: TypeAlias = Callable[[int], tuple[Depth, Float32, Image]]
+"""Of a frame the depth, the deviation of its inverse in 1/m, and the reference image."""
+
+
+def _by_matching(
+    log: MeasurementLog, pictures: Pictures, samples: Sequence[int], cameras: int | None
+) -> Measured:
+    """Depth by matching the images, whose steps are learnt from some frames."""
+    corrections = [step.rig_correction for step in log if step.rig_correction is not None]
+    matcher = DenseStereo(log.rig, cameras, corrections[-1] if corrections else None)
+    matcher.learn_steps(_readable(lambda row: matcher.corrected(pictures(row)), samples))
+    product = np.float32(log.rig.fx * log.rig.baseline)
+
+    def measure(row: int) -> tuple[Depth, Float32, Image]:
+        images = matcher.corrected(pictures(row))
+        disparity, sigma = matcher.measure(images)
+        known = disparity > 0.0
+        depth = np.where(known, product / np.where(known, disparity, np.float32(1.0)), 0.0)
+        return depth.astype(np.float32), sigma / product, images[0]
+
+    return measure
+
+
+def _by_camera(depths: Callable[[int], Depth], pictures: Pictures) -> Measured:
+    """Depth as a depth camera gives it, with the deviation of such cameras."""
+
+    def measure(row: int) -> tuple[Depth, Float32, Image]:
+        depth = depths(row)
+        depth = np.where(np.isfinite(depth), depth, np.float32(0.0))
+        return depth, np.full_like(depth, DEPTH_SIGMA_M), pictures(row)[0]
+
+    return measure
+
+
+def fuse(
+    log: MeasurementLog,
+    estimate: Estimate,
+    rows: Sequence[int],
+    pictures: Pictures,
+    depths: Callable[[int], Depth] | None = None,
+    settings: DenseSettings | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> DenseMap:
+    """The dense map of frames along a trajectory.
+
+    Args:
+        log: of the run, for the rig and its correction.
+        estimate: poses of the right camera, with covariances.
+        rows: of each pose the frame that ``pictures`` and ``depths`` take.
+        pictures: images; frames that cannot be read are passed over.
+        depths: of a depth camera; None: from the images.
+        settings: None for the defaults.
+        progress: called with what is under way, how much of it is done, and of how much.
+
+    Raises:
+        DatasetError: no image can be read, or none shows any depth.
+    """
+    settings, rig = settings or DenseSettings(), log.rig
+    if settings.cameras is not None and settings.cameras > rig.cameras:
+        raise ConfigError(f"--cameras 3: the rig has {rig.cameras}; leave it out")
+    used = list(range(0, len(rows), settings.every))
+    some = np.unique(np.linspace(0, len(used) - 1, _SAMPLES).astype(int))
+    samples = [rows[used[k]] for k in some]
+    if depths is None:
+        measured = _by_matching(log, pictures, samples, settings.cameras)
+        farthest = rig.fx * rig.baseline / MIN_DISPARITY_PX
+        noise = _TYPICAL_PX / (rig.fx * rig.baseline)
+    else:
+        measured, farthest, noise = _by_camera(depths, pictures), np.inf, DEPTH_SIGMA_M
+    found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples)]
+    seen = np.concatenate([np.empty(0, np.float32), *found])
+    if not len(seen):
+        raise DatasetError(
+            "the images of this recording show no depth: no pair agrees anywhere; check the "
+            "calibration by fgslam inspect RECORDING"
+        )
+    voxel = settings.voxel_m or _VOXEL_PX * float(np.median(seen)) / rig.fx
+    most = settings.range_m or min(farthest, float(np.sqrt(TRUNCATION_VOXELS * voxel / noise)))
+    fusion, scans, rays = Fusion(_matrix(rig), voxel), [], _rays(rig)
+    for done, k in enumerate(used):
+        progress("fusing", done, len(used))
+        try:
+            depth, sigma, image = measured(rows[k])
+        except FrameError:
+            continue
+        sure = (depth < most) & (sigma * depth * depth < _CUT_VOXELS * voxel)
+        depth = np.where(sure, depth, np.float32(0.0))
+        shared = _shared(log, estimate.covariances[k], depth)
+        frame = DepthFrame(depth, sigma, image, estimate.trajectory.poses[k], shared)
+        fusion.add(frame)
+        scans.append(scan_columns(frame, rays))
+    progress("fusing", len(used), len(used))
+    surface = fusion.surface(KEPT_SIGMA_VOXELS * voxel)
+    if not len(surface.positions):
+        raise DatasetError(
+            f"nothing was seen as well as {100.0 * KEPT_SIGMA_VOXELS * voxel:.3g} cm within "
+            f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g})"
+        )
+    mounted = not body_is_camera(rig.bTc)
+    cUp = rig.bTc[2, :3] if mounted else np.array([0.0, -1.0, 0.0])
+    up = (estimate.trajectory.poses[:, :3, :3] @ cUp).mean(axis=0)
+    # What keeps to its vertical is on wheels.
+    length = float(np.linalg.norm(up))
+    level = mounted and length > _LEVEL
+    return DenseMap(surface, voxel, most, len(scans), tuple(scans), up / length, level)
+
+
+def _readable(read: Callable[[int], _Read], rows: Sequence[int]) -> list[_Read]:
+    """What is read of those frames that can be."""
+    found = []
+    for row in rows:
+        try:
+            found.append(read(row))
+        except FrameError:
+            continue
+    return found
+
+
+def _matrix(rig: CameraRig) -> FloatArray:
+    return np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+
+
+def _rays(rig: CameraRig) -> Float32:
+    """(height, width, 3) of depth one."""
+    rows, columns = np.indices((rig.height, rig.width), np.float32)
+    rays = [(columns - rig.cx) / rig.fx, (rows - rig.cy) / rig.fy, np.ones_like(rows)]
+    return np.stack(rays, axis=-1).astype(np.float32)
+
+
+def _shared(log: MeasurementLog, covariance: FloatArray, depth: Depth) -> Float32:
+    """Variance (height, width), of one axis, of what all pixels have in common, m^2.
+
+    The pose's, whose rotation moves what is far away more; and of the calibration the baseline's
+    length and what no term of the correction follows.
+    """
+    turn, move = np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
+    at = move / 3.0 + 2.0 / 9.0 * turn * depth**2
+    rig, settled = log.rig, log.increments[-1].settled_rig
+    if not rig.exact:
+        field = FIELD_PX if settled is None else settled.field_px
+        length = shared_information(rig, EXPECTED_PX)[_LENGTH, _LENGTH]
+        product = rig.fx * rig.baseline
+        at = at + depth**2 / length + 2.0 * (field * depth**2 / product) ** 2
+    return np.asarray(at, np.float32)
