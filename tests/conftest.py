@@ -14,8 +14,8 @@ import pytest
 from hypothesis import settings
 
 from fgslam.core.errors import MissingDependencyError
-from fgslam.core.threads import one_blas_thread
 from fgslam.core.open3d_library import load_open3d
+from fgslam.core.threads import one_blas_thread
 
 # Thousands of collected tests are objects that stay: to look for cycles among them every 700 new
 # ones took two fifths of the time of collecting.

@@ -480,7 +480,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
         max_range (--range METRES): farthest depth; default by the cameras' precision
         cameras: 2 leaves the top camera out
         every: of the frames every so many are matched densely
-        recording: where the run's recording is now; default where it was, or beside the run
+        recording: where the run's recording is now; default where it was, or next to the run
         overwrite: replace an earlier one
     """
     from fgslam.cli.console import progress_bar

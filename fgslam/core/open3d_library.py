@@ -54,7 +54,8 @@ def load_open3d() -> ModuleType:
         return importlib.import_module("open3d")
     except ModuleNotFoundError as error:
         raise MissingDependencyError(
-            "the rendered lab needs Open3D, which is not installed: pip install open3d"
+            "Open3D, which the rendered lab and dense maps need, is not installed: pip install "
+            "open3d"
         ) from error
     except (MemoryError, ImportError, OSError) as error:
         if isinstance(error, MemoryError) or is_shortage(error):

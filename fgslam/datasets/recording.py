@@ -16,13 +16,13 @@ from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OneImageError
+from fgslam.core.errors import CalibrationError, DatasetError, OneImageError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
-from fgslam.datasets.images import Depth, DepthLoader, ImageLoader
+from fgslam.datasets.images import DepthLoader, ImageLoader
 from fgslam.datasets.ledger import Entry
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
@@ -113,13 +113,6 @@ class Recording(Brief):
         """Images of frame ``i`` in red, green, blue, or grey where the recording is. FrameError."""
         self._check_index(i, 0)
         return self.load_images(int(self.indices[i]), True)
-
-    def depth(self, i: int) -> Depth:
-        """Depth of frame ``i``'s reference image, where a camera gives it. FrameError."""
-        if self.load_depth is None:
-            raise FrameError(f"{self.name} has no depth images; its cameras give images alone")
-        self._check_index(i, 0)
-        return self.load_depth(int(self.indices[i]))
 
     def odometry(self, i: int) -> Odometry | None:
         """Body motion from frame ``i - 1`` to ``i``, 1 <= i < len; None where none was recorded.

@@ -17,8 +17,8 @@ from fgslam.core.sensors import CameraRig, body_is_camera
 from fgslam.core.types import Estimate
 from fgslam.datasets.depth import DEPTH_SIGMA_M
 from fgslam.datasets.images import Depth
-from fgslam.frontend.dense import MIN_DISPARITY_PX, DenseStereo
-from fgslam.report.dense import (
+from fgslam.frontend.dense_stereo import MIN_DISPARITY_PX, DenseStereo
+from fgslam.report.surface import (
     KEPT_SIGMA_VOXELS,
     TRUNCATION_VOXELS,
     ColumnScan,
@@ -38,12 +38,12 @@ Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
 
 _Read = TypeVar("_Read")
 
-_VOXEL_PX = 3.0  # of the image, at the median depth
+_VOXEL_PX, _FINEST_PX = 3.0, 0.5  # of the image, at the median depth
 _TYPICAL_PX = 0.1  # deviation of a disparity, which bounds how far it is worth to look
 _SAMPLES = 12  # frames from which steps of disparity and the median depth are learnt
 _LENGTH = SHARED.index("baseline")
 _LEVEL = np.cos(np.deg2rad(2.5))
-_CUT_VOXELS = 2.0 * TRUNCATION_VOXELS  # deviation of a depth beyond which it says nothing
+_CUT_VOXELS = 2.0 * TRUNCATION_VOXELS  # deviation of a depth beyond which it is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,14 +173,21 @@ def fuse(
         noise = _TYPICAL_PX / (rig.fx * rig.baseline)
     else:
         measured, farthest, noise = _by_camera(depths, pictures), np.inf, DEPTH_SIGMA_M
-    found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples)]
+    found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples[::3])]
     seen = np.concatenate([np.empty(0, np.float32), *found])
     if not len(seen):
         raise DatasetError(
             "the images of this recording show no depth: no pair agrees anywhere; check the "
             "calibration by fgslam inspect RECORDING"
         )
-    voxel = settings.voxel_m or _VOXEL_PX * float(np.median(seen)) / rig.fx
+    pixel = float(np.median(seen)) / rig.fx
+    voxel = settings.voxel_m or _VOXEL_PX * pixel
+    if voxel < _FINEST_PX * pixel:
+        raise ConfigError(
+            f"--voxel is {voxel:g}, finer than the images show anything: a pixel is "
+            f"{100.0 * pixel:.2g} cm wide at the median depth; use --voxel {pixel:.2g}, or leave "
+            "it out"
+        )
     most = settings.range_m or min(farthest, float(np.sqrt(TRUNCATION_VOXELS * voxel / noise)))
     fusion, scans, rays = Fusion(_matrix(rig), voxel), [], _rays(rig)
     for done, k in enumerate(used):
@@ -200,7 +207,7 @@ def fuse(
     if not len(surface.positions):
         raise DatasetError(
             f"nothing was seen as well as {100.0 * KEPT_SIGMA_VOXELS * voxel:.3g} cm within "
-            f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g})"
+            f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g}) or a larger --range"
         )
     mounted = not body_is_camera(rig.bTc)
     cUp = rig.bTc[2, :3] if mounted else np.array([0.0, -1.0, 0.0])

@@ -30,7 +30,6 @@ from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.content import read_metrics
-from fgslam.report.dense import FREE, OCCUPIED, require_cloud_suffix
 from fgslam.report.formats import (
     MCAP_SUFFIX,
     Axes,
@@ -45,6 +44,7 @@ from fgslam.report.formats import (
     write_trajectory,
 )
 from fgslam.report.results import NO_LANDMARKS
+from fgslam.report.surface import FREE, OCCUPIED, require_cloud_suffix
 from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
 from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
@@ -70,9 +70,9 @@ class Wanted:
         colour: the map in the images' colours, with normals.
         dense: surface of all that the images show, as points, `.ply` or `.pcd`.
         mesh: the same as triangles, `.ply`.
-        grid: Nav2's `.yaml`, its `.pgm` beside it.
+        grid: Nav2's `.yaml`, its `.pgm` next to it.
         how: the dense map is made.
-        recording: where the run's recording is now, None: where it was, or beside the run.
+        recording: where the run's recording is now, None: where it was, or next to the run.
         overwrite: replace files that are there.
     """
 
@@ -225,7 +225,8 @@ def _require_outputs(run: Path, wanted: Wanted) -> None:
         require_cloud_suffix(wanted.mesh, triangles=True)
     if wanted.grid is not None and wanted.grid.suffix.lower() not in (".yaml", ".yml"):
         raise OutputError(
-            f"cannot write {wanted.grid}: a grid is a .yaml with a .pgm beside it; give a name.yaml"
+            f"cannot write {wanted.grid}: a grid is a .yaml with a .pgm next to it; give "
+            "a name.yaml"
         )
 
 
@@ -592,7 +593,9 @@ def frames_of(
             )
         recording = open_recording(dataset)
         stamps, pictures = recording.timestamps, recording.colour
-        depths = recording.depth if recording.load_depth else None
+        if (load := recording.load_depth) is not None:
+            numbers = recording.indices.tolist()
+            depths = lambda i: load(numbers[i])  # noqa: E731
     rows = np.searchsorted(stamps, trajectory.timestamps - 1e-9)
     if (rows >= len(stamps)).any() or np.abs(stamps[rows] - trajectory.timestamps).max() > 1e-6:
         raise DatasetError(

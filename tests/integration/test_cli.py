@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -326,14 +327,62 @@ def test_mistakes_of_film(
 
 
 def test_export_of_images_says_where_the_recording_is_gone(
-    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+    finished: Finished, recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     run = Path(shutil.copytree(finished.folder, tmp_path / "run"))
     config = run / "config.yaml"
     text = config.read_text()
     config.write_text(re.sub(r"path: .*", "path: /gone", text))
     text = mistake(capfd, monkeypatch, "export", run, "--images", tmp_path / "model")
-    assert "/gone" in text
+    assert "/gone: the run's recording is not there any more" in text
+    assert "--recording PATH" in text
+    given = ("--images", tmp_path / "model", "--recording", recording)
+    assert main(monkeypatch, "export", run, *given) == 0
+
+
+def test_a_run_that_was_moved_with_its_recording_finds_it(
+    finished: Finished, recording: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """Beside the run, or above it; from any folder."""
+    run = Path(shutil.copytree(finished.folder, tmp_path / "runs" / "one"))
+    shutil.copytree(recording, tmp_path / recording.name)
+    config = run / "config.yaml"
+    config.write_text(re.sub(r"path: .*", f"path: /gone/{recording.name}", config.read_text()))
+    monkeypatch.chdir(tmp_path / "runs")
+    assert main(monkeypatch, "export", run, "--images", tmp_path / "model") == 0
+
+
+def test_export_of_a_dense_map_as_cloud_mesh_and_grid(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture, open3d: ModuleType
+) -> None:
+    files = [tmp_path / name for name in ("cloud.ply", "mesh.ply", "map.yaml")]
+    given = ("--dense", files[0], "--mesh", files[1], "--grid", files[2], "--every", 4)
+    assert main(monkeypatch, "export", finished.folder, *given) == 0
+    said = capfd.readouterr().out
+    assert "points in" in said
+    assert "% free" in said
+    cloud = open3d.t.io.read_point_cloud(str(files[0]))
+    assert len(cloud.point["sigma"]) == len(open3d.io.read_triangle_mesh(str(files[1])).vertices)
+    assert (tmp_path / "map.pgm").is_file()
+
+
+def test_mistakes_of_dense_export(
+    finished: Finished, recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    def reported(*arguments: object) -> str:
+        return mistake(capfd, monkeypatch, "export", finished.folder, *arguments)
+
+    cloud = tmp_path / "cloud.ply"
+    assert "--voxel is 0; give metres above 0" in reported("--dense", cloud, "--voxel", 0)
+    assert "unknown cloud format '.obj'; use .ply" in reported("--dense", tmp_path / "a.obj")
+    assert "unknown mesh format '.pcd'; use .ply" in reported("--mesh", tmp_path / "a.pcd")
+    assert "a .yaml with a .pgm next to it" in reported("--grid", tmp_path / "map.png")
+    inside = recording / "cloud.ply"
+    inside.write_text("")
+    assert f"it is part of {recording}, which is read" in reported("--dense", inside)
+    inside.unlink()
+    (tmp_path / "map.pgm").write_text("")
+    assert "map.pgm: is there already" in reported("--grid", tmp_path / "map.yaml")
 
 
 def test_an_export_never_replaces_the_run_itself(
@@ -363,7 +412,7 @@ def test_mistakes_of_export(
         return mistake(capfd, monkeypatch, "export", *arguments)
 
     run = finished.folder
-    nothing = "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or"
+    nothing = "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o, "
     assert nothing in reported(run)
     assert "use .tum, .kitti or .csv" in reported(run, "--trajectory", tmp_path / "t.txt")
     assert "use .g2o" in reported(run, "--graph", tmp_path / "t.graph")

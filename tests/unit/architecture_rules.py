@@ -56,7 +56,7 @@ SLAM_ROOMS = (
 
 THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
     "cv2": frozenset({"frontend", "datasets", "cameras", "report"}),
-    "open3d": frozenset({"worlds", "report"}),
+    "open3d": frozenset({"core"}),
     "gtsam": frozenset({"factors", "backend"}),
     "gtsam_unstable": frozenset({"factors", "backend"}),
     "distributed": frozenset({"runs"}),

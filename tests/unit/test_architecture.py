@@ -72,8 +72,8 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
     files = {
         "core/arrays.py": "import numpy as np\n",
         "core/geometry.py": "from fgslam.core.arrays import x\n",
-        "worlds/open3d_library.py": "def load():\n    import open3d\n    return open3d\n",
-        "datasets/lab.py": "import cv2\nfrom fgslam.worlds import open3d_library\n",
+        "core/open3d_library.py": "def load():\n    import open3d\n    return open3d\n",
+        "datasets/lab.py": "import cv2\nfrom fgslam.core import open3d_library\n",
         "factors/stereo.py": "import gtsam\nfrom fgslam.core import arrays\n",
         "backend/isam2.py": "import gtsam\nfrom fgslam.factors.landmark import f\n",
         "slam/pipeline.py": "from fgslam.backend import isam2\nfrom fgslam.datasets import lab\n",
@@ -147,7 +147,7 @@ LIBRARY_CASES = {
     "open3d in the pipeline": (
         "slam/pipeline.py",
         "def f():\n    import open3d\n",
-        "'open3d' only in report, worlds",
+        "'open3d' only in core",
     ),
 }
 

@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from fgslam.core.errors import MemoryShortageError, MissingDependencyError
 from fgslam.core import open3d_library
+from fgslam.core.errors import MemoryShortageError, MissingDependencyError
 from fgslam.core.open3d_library import (
     DEBIAN_PACKAGES,
     explain_missing_library,

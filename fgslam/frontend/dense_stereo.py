@@ -2,7 +2,7 @@
 
 Semi-global matching (Hirschmueller 2008) of the right image with each other one; its sub-pixel
 steps made equally likely by a table; where two pairs agree their mean; then Gauss-Newton on inverse
-depth over all pairs at once. docs/derivations/measurements.md.
+depth over all pairs at once. docs/howto/dense_map.md.
 """
 
 from __future__ import annotations

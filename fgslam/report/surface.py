@@ -335,7 +335,7 @@ class Grid:
         return float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0))))
 
     def save(self, path: Path) -> None:
-        """Writes `.yaml` and beside it the `.pgm` that it names. Raises OutputError."""
+        """Writes `.yaml` and next to it the `.pgm` that it names. Raises OutputError."""
         image = path.with_suffix(".pgm")
         rows, columns = self.cells.shape
         write_bytes(image, f"P5\n{columns} {rows}\n255\n".encode() + self.cells.tobytes())
