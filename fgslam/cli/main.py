@@ -532,6 +532,8 @@ def film(
     out: Annotated[Path, typer.Argument()],
     estimator: str | None = None,
     taught: Path | None = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000.0)] = 1.0,
+    width: Annotated[int, typer.Option(min=320, max=3840)] = 1280,
     overwrite: bool = False,
 ) -> None:
     """Make a film of a run: images with their matches, next to the map as it grows.
@@ -545,13 +547,15 @@ def film(
         estimator: whose path and map; default the one that steered
         taught (DIR): of a route that was followed: the run folder of fgslam teach (its --report),
             for the pictures of path images
+        speed (FACTOR): over the recording's
+        width (PIXELS): of its frames
         overwrite: replace an earlier one
     """
     from fgslam.cli.console import progress_bar
     from fgslam.runs.view import film_of_run
 
     with progress_bar() as progress:
-        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite)
+        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite, speed, width)
     typer.echo(line)
 
 

@@ -393,7 +393,8 @@ class VideoFrames:
 # Films as files: written frame by frame, MP4 or GIF
 
 _GIF_FPS = 10.0  # what viewers show at least; more only makes the file larger
-_GIF_WIDTH = 720
+_GIF_WIDTHS = (720, 560, 440, 360)
+_GIF_BYTES = 3_000_000  # what pages and READMEs take: a larger one is made narrower
 
 
 def require_film_suffix(path: Path) -> None:
@@ -404,16 +405,17 @@ def require_film_suffix(path: Path) -> None:
         )
 
 
-def write_film(path: Path, frames: Iterable[Image], fps: float) -> int:
+def write_film(path: Path, frames: Iterable[Image], fps: float, width: int | None = None) -> int:
     """Writes a film whole or not at all; how many frames it has.
 
-    A .gif has every so-maniest frame, so that it shows at most ten a second, at most 720 pixels
-    wide.
+    A .gif has every so-maniest frame, so that it shows at most ten a second, and is at
+    most 720 pixels wide, or narrower to stay below 3 MB.
 
     Args:
         path: the file, .mp4 or .gif.
         frames: (height, width, 3) red, green, blue, uint8, all of one even size.
         fps: frames a second.
+        width: to which frames are made smaller or larger, pixels; None: as they are.
 
     Raises:
         OutputError: another ending, no frame at all, or writing failed.
@@ -421,11 +423,19 @@ def write_film(path: Path, frames: Iterable[Image], fps: float) -> int:
     require_film_suffix(path)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     remove_left_behind(path)
+    sized = frames if width is None else (_of_width(frame, width) for frame in frames)
     with replacing(path) as partial:
-        count = write(partial, frames, fps)
+        count = write(partial, sized, fps)
         if not count:
             raise OutputError(f"cannot write {path}: there is no frame to show")
     return count
+
+
+def _of_width(frame: Image, width: int) -> Image:
+    """A frame of that width and an even height: encoders know no other."""
+    height = 2 * round(0.5 * width * frame.shape[0] / frame.shape[1])
+    size = 2 * (width // 2), height
+    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
@@ -455,14 +465,15 @@ def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
 
 def _write_gif(path: Path, frames: Iterable[Image], fps: float) -> int:
     step = max(1, round(fps / _GIF_FPS))
-    pages: list[Pillow.Image] = []
-    for frame in islice(frames, 0, None, step):
-        page = Pillow.fromarray(frame)
-        if page.width > _GIF_WIDTH:
-            page = page.resize((_GIF_WIDTH, round(page.height * _GIF_WIDTH / page.width)))
-        pages.append(page.quantize(64))  # a palette each: a few hundred kilobytes in all
-    if not pages:
-        return 0
-    duration = round(1000.0 * step / fps)
-    pages[0].save(path, save_all=True, append_images=pages[1:], duration=duration, loop=0)
+    frames = islice(frames, 0, None, step)
+    pages = [Pillow.fromarray(_of_width(f, min(f.shape[1], _GIF_WIDTHS[0]))) for f in frames]
+    for width in _GIF_WIDTHS if pages else ():
+        height = round(width * pages[0].height / pages[0].width)
+        smaller = [page.resize((width, height)) for page in pages if width < page.width] or pages
+        # A palette each: a few hundred kilobytes in all.
+        first, *rest = (page.quantize(64) for page in smaller)
+        duration = round(1000.0 * step / fps)
+        first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
+        if path.stat().st_size < _GIF_BYTES:
+            break
     return len(pages)

@@ -5,6 +5,7 @@ A frame takes milliseconds: every run draws some.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,7 @@ _ALONE_PX, _BESIDE_PX = 1400, 900  # widths of images, alone in a row or not
 _PANORAMIC_ASPECT = 2.2  # wider images are stacked rather than set side by side
 _HEADING_PX, _BAR_PX, _MARGIN_PX = 44, 110, 10
 _TEXT_PX = 20
+_FILM_PX, _FILM_IMAGE_PX = (540, 1280), 664  # height and width of a frame; room for its image
 _SHIFT = 4  # binary digits of a pixel's part in OpenCV's drawing
 _CAMERAS = ("Right", "Left", "Top")
 # The descriptor covers a window of about twelve scales; a square of four stays readable.
@@ -155,50 +157,146 @@ def draw_plan(path: Path, data: ReportData) -> None:
     """
     one, level = data.estimators[0], level_axes(data.up)[:2]
     way, dots = one.final_poses[:, :3, 3] @ level.T, one.landmarks.positions @ level.T
-    limits = np.array(bulk_limits(way, dots))
-    size = np.diff(limits)[:, 0]
-    scale = _ALONE_PX / float(size.max())
-    wide, tall = (max(round(scale * side), _ALONE_PX // 3) for side in size.tolist())
-    canvas = np.full((tall, wide, 3), 255, np.uint8)
-
-    def pixels(points: FloatArray) -> FloatArray:
-        middle = np.array([wide, tall]) / 2.0
-        return np.asarray(middle + scale * (points - limits.mean(axis=1)) * [1.0, -1.0])
-
-    inside = ((dots > limits[:, 0]) & (dots < limits[:, 1])).all(axis=1)
-    columns, rows = np.clip(pixels(dots[inside]).astype(int), 0, [wide - 1, tall - 1]).T
-    for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        canvas[np.minimum(rows + down, tall - 1), np.minimum(columns + right, wide - 1)] = _bgr(
-            _DOT
-        )
-    lines = [(way, _bgr(SKY), 3)]
-    if data.truth is not None:
-        lines.append((data.truth.poses[:, :3, 3] @ level.T, _bgr(INK), 1))
-    for points, colour, thickness in lines:
-        known = points[np.isfinite(points).all(axis=1)]
-        cv2.polylines(
-            canvas, [_fixed(pixels(known))], False, colour, thickness, cv2.LINE_AA, _SHIFT
-        )
-    _draw_dots(canvas, pixels(way[-1:]), [_bgr(ORANGE)])
-    # The longest of 1, 2 and 5 times a power of ten metres that a third of the picture holds.
-    room = wide / 3.0 / scale
-    power = 10.0 ** np.floor(np.log10(room))
-    length = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= room)
-    end = np.array([[_MARGIN_PX, tall - 15.0], [_MARGIN_PX + scale * length, tall - 15.0]])
-    cv2.polylines(canvas, [_fixed(end)], False, _bgr(INK), 3, cv2.LINE_AA, _SHIFT)
-    _put_text(canvas, f"{length:g} m", (_MARGIN_PX, tall - 24.0))
-    words = "blue: path; grey: landmarks" + "; black: truth" * (data.truth is not None)
+    truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ level.T
+    sides = np.diff(bulk_limits(way, dots))[:, 0]
+    shape = np.maximum(_ALONE_PX * sides / float(sides.max()), _ALONE_PX // 3)
+    canvas = _Plan(way, dots, truth, (round(shape[0]), round(shape[1]))).drawn(dots, len(way) - 1)
+    words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
     title = f"{data.title}: {one.title}, {len(dots):,} landmarks"
     _write(path, _headed(_headed(canvas, words, ""), title, ""))
+
+
+class _Plan:
+    """Path and landmarks from above, drawn again as they grow."""
+
+    def __init__(
+        self, way: FloatArray, dots: FloatArray, truth: FloatArray | None, size: tuple[int, int]
+    ) -> None:
+        """Takes all that will be drawn, metres to the right and ahead, and the size in pixels."""
+        limits, (wide, tall) = np.array(bulk_limits(way, dots)), size
+        scale = float(np.min(np.array(size) / np.diff(limits)[:, 0]))
+        self._middle, self._scale = limits.mean(axis=1), scale
+        self._ground = np.full((tall, wide, 3), 255, np.uint8)
+        self._way = self._pixels(way)
+        if truth is not None:
+            _draw_path(self._ground, self._pixels(truth), INK, 1)
+        # The longest of 1, 2 and 5 times a power of ten metres that a third of the picture holds.
+        room = wide / 3.0 / scale
+        power = 10.0 ** np.floor(np.log10(room))
+        length = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= room)
+        ends = [[_MARGIN_PX, tall - 15.0], [_MARGIN_PX + scale * length, tall - 15.0]]
+        _draw_path(self._ground, np.array(ends), INK, 3)
+        _put_text(self._ground, f"{length:g} m", (_MARGIN_PX, tall - 24.0))
+
+    def _pixels(self, points: FloatArray) -> FloatArray:
+        middle = np.array(self._ground.shape[1::-1]) / 2.0
+        return np.asarray(middle + self._scale * (points - self._middle) * [1.0, -1.0])
+
+    def drawn(self, dots: FloatArray, row: int) -> Image:
+        """Landmarks (l, 2) and the path up to a pose."""
+        canvas, (tall, wide) = self._ground.copy(), self._ground.shape[:2]
+        at = self._pixels(dots)
+        inside = ((at >= 0.0) & (at < [wide, tall])).all(axis=1)
+        columns, rows = at[inside].astype(int).T
+        for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            near = np.minimum(rows + down, tall - 1), np.minimum(columns + right, wide - 1)
+            canvas[near] = np.minimum(canvas[near], np.array(_bgr(_DOT), np.uint8))
+        _draw_path(canvas, self._way[: row + 1], SKY, 3)
+        _draw_dots(canvas, self._way[row : row + 1], [_bgr(ORANGE)])
+        return canvas
+
+
+def _draw_path(canvas: Image, points: FloatArray, colour: str, thickness: int) -> None:
+    known = points[np.isfinite(points).all(axis=1)]
+    cv2.polylines(canvas, [_fixed(known)], False, _bgr(colour), thickness, cv2.LINE_AA, _SHIFT)
+
+
+# ------------------------------------------------------------------------------------------
+# Frames of a film, one after the other
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One frame of a drive.
+
+    Attributes:
+        image: what the reference camera saw; None where it cannot be read.
+        before, after: (k, 2) pixels of the matched landmarks in the last frame and in this one.
+        new: (l, 2) pixels of landmarks seen for the first time.
+        title: above the image.
+    """
+
+    image: Image | None
+    before: FloatArray
+    after: FloatArray
+    new: FloatArray
+    title: str
+
+
+class FilmCanvas:
+    """A drive: the image with its matches, next to the growing map."""
+
+    def __init__(
+        self, path: FloatArray, landmarks: FloatArray, truth: FloatArray | None, title: str
+    ) -> None:
+        """Takes what does not change.
+
+        Args:
+            path: (n, 2) metres to the right and ahead, of all poses.
+            landmarks: (m, 2) all that will be drawn, for the limits.
+            truth: (k, 2) true path, or None.
+            title: above the map.
+        """
+        tall, wide = _FILM_PX
+        room = wide - _FILM_IMAGE_PX - _MARGIN_PX, tall - 2 * _HEADING_PX
+        self._plan, self._title = _Plan(path, landmarks, truth, room), title
+        self._words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
+
+    def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
+        """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
+        whole = np.full((*_FILM_PX, 3), 255, np.uint8)
+        plan = _headed(self._plan.drawn(known, row), self._title, "")
+        whole[: len(plan), -plan.shape[1] :] = plan
+        _put_text(whole, self._words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
+        _put_text(whole, moment.title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
+        if moment.image is not None:
+            panel = self._with_matches(moment, moment.image)
+            whole[_HEADING_PX : _HEADING_PX + len(panel), : panel.shape[1]] = panel
+        words = "orange: matched, with its motion; yellow: new landmark"
+        _put_text(whole, words, (_MARGIN_PX, _FILM_PX[0] - 16))
+        return np.asarray(whole[..., ::-1])
+
+    def _with_matches(self, moment: Moment, image: Image) -> Image:
+        tall, wide = image.shape[:2]
+        scale = min(_FILM_IMAGE_PX / wide, (_FILM_PX[0] - 2 * _HEADING_PX) / tall)
+        dimmed = _dimmed(image)
+        coloured = (
+            cv2.cvtColor(dimmed, cv2.COLOR_GRAY2BGR) if dimmed.ndim == 2 else dimmed[..., ::-1]
+        )
+        size = round(scale * wide), round(scale * tall)
+        panel: Image = np.asarray(
+            cv2.resize(coloured, size, interpolation=cv2.INTER_AREA), np.uint8
+        )
+        start, end, new = (
+            scale * (pixels + 0.5) for pixels in (moment.before, moment.after, moment.new)
+        )
+        _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
+        _draw_dots(panel, end, [_bgr(ORANGE)], 3)
+        _draw_dots(panel, new, [_bgr(YELLOW)], 2)
+        return panel
 
 
 def _enlarged(image: Image, width: int) -> tuple[Image, float]:
     """The image, dimmed, in blue, green, red at a width near to ``width``; and its scale."""
     scale = max(1.0, float(round(width / image.shape[1])))
-    darkest, span = dimmed_range(image)
-    grey = cv2.convertScaleAbs(np.maximum(image, darkest) - darkest, alpha=255.0 / span)
-    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    grey = cv2.resize(_dimmed(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8), scale
+
+
+def _dimmed(image: Image) -> Image:
+    darkest, span = dimmed_range(image)
+    above = np.maximum(image, darkest) - darkest
+    return np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), np.uint8)
 
 
 def dimmed_range(image: Image) -> tuple[float, float]:
@@ -239,12 +337,14 @@ def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]
         cv2.polylines(canvas, own, False, colour, 2, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_dots(canvas: Image, centres: FloatArray, colours: list[tuple[int, ...]]) -> None:
+def _draw_dots(
+    canvas: Image, centres: FloatArray, colours: list[tuple[int, ...]], radius: int = 4
+) -> None:
     for k, centre in enumerate(_fixed(centres)):
         place = tuple(centre.tolist())
-        cv2.circle(canvas, place, 5 << _SHIFT, _bgr(_RIM), -1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(canvas, place, (radius + 1) << _SHIFT, _bgr(_RIM), -1, cv2.LINE_AA, _SHIFT)
         colour = colours[k % len(colours)]
-        cv2.circle(canvas, place, 4 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(canvas, place, radius << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
 
 
 def _fixed(points: FloatArray) -> npt.NDArray[np.int32]:

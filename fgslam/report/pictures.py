@@ -24,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.files import replacing
-from fgslam.report.content import Figure, bulk_limits
+from fgslam.report.content import Figure
 from fgslam.report.overlays import INK, ORANGE, SKY, YELLOW, dimmed_range
 
 VERMILLION = "#D55E00"
@@ -488,8 +488,8 @@ def draw_cameras(path: Path, title: str, cameras: Sequence[CameraDrawing]) -> No
 # --------------------------------------------------------------------------------------------
 # Frames of films, one after the other onto one canvas
 
-_FILM_INCHES, _ROUTE_INCHES = (12.8, 5.4), (12.8, 7.2)
-_FILM_DPI = 100  # 1280 x 540, and 1280 x 720
+_ROUTE_INCHES = (12.8, 7.2)
+_FILM_DPI = 100  # 1280 x 720
 _DOTS = "#8a939c"
 _styled = matplotlib.style.context(PICTURE_STYLE, after_reset=True)
 
@@ -499,81 +499,6 @@ def _pixels(figure: Canvas) -> Image:
     agg: Any = figure.canvas
     agg.draw()
     return np.asarray(agg.buffer_rgba())[..., :3].copy()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Moment:
-    """One frame of a drive.
-
-    Attributes:
-        image: what the reference camera saw; None where it cannot be read.
-        before, after: (k, 2) pixels of the matched landmarks in the last frame and in this one.
-        new: (l, 2) pixels of landmarks seen for the first time.
-        title: above the image.
-    """
-
-    image: Image | None
-    before: FloatArray
-    after: FloatArray
-    new: FloatArray
-    title: str
-
-
-class FilmCanvas:
-    """A drive: the image with its matches, next to the growing map."""
-
-    @_styled
-    def __init__(
-        self, path: FloatArray, landmarks: FloatArray, truth: FloatArray | None, title: str
-    ) -> None:
-        """Takes what does not change.
-
-        Args:
-            path: (n, 2) metres to the right and ahead, of all poses.
-            landmarks: (m, 2) all that will be drawn, for the limits.
-            truth: (k, 2) true path, or None.
-            title: above the map.
-        """
-        self._figure = Canvas(figsize=_FILM_INCHES, dpi=_FILM_DPI)
-        FigureCanvasAgg(self._figure)
-        self._image, plan = self._figure.subplots(1, 2, width_ratios=(1.15, 1.0))
-        self._figure.subplots_adjust(0.02, 0.12, 0.98, 0.92, 0.13)
-        # The shorter side is widened to the panel's shape.
-        limits, panel = np.array(bulk_limits(path, landmarks)), plan.get_window_extent()
-        size, room = np.diff(limits)[:, 0], np.array([panel.width, panel.height])
-        more = (room * np.max(size / room) - size) / 2.0
-        x, y = np.column_stack([limits[:, 0] - more, limits[:, 1] + more])
-        plan.set(xlim=x, ylim=y, aspect="equal", title=title)
-        plan.set(xlabel="right (m)", ylabel="ahead (m)")
-        if truth is not None:
-            plan.plot(*truth.T, "--", color=INK, linewidth=1.0, label="truth")
-        (self._dots,) = plan.plot([], [], ".", color=_DOTS, markersize=2.0)
-        (self._path,) = plan.plot([], [], color=SKY, linewidth=2.2, label="estimate")
-        (self._here,) = plan.plot([], [], "o", color=ORANGE, markersize=7.0)
-        plan.legend(loc="upper right")
-        self._poses = path
-
-    @_styled
-    def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
-        """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
-        axes = self._image
-        axes.clear()
-        if moment.image is None:
-            axes.set_axis_off()
-            axes.set_title(moment.title)
-        else:
-            show_image(axes, moment.image, moment.title)
-            flow = list(np.stack([moment.before, moment.after], axis=1))
-            axes.add_collection(LineCollection(flow, linewidths=1.4, colors=SKY), autolim=False)
-            matched = {"markersize": 3.5, "label": "matched, with its motion"}
-            axes.plot(*moment.after.T, "o", color=ORANGE, **matched)
-            axes.plot(*moment.new.T, "+", color=YELLOW, markersize=5.0, label="new landmark")
-            legend = axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=2)
-            legend.legend_handles[1].set_color(INK)  # yellow on white is hard to see
-        self._dots.set_data(*known.T)
-        self._path.set_data(*self._poses[: row + 1].T)
-        self._here.set_data(*self._poses[row : row + 1].T)
-        return _pixels(self._figure)
 
 
 _MOST_NAMED = 25  # path images whose numbers stand below the route

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -41,7 +43,8 @@ from fgslam.report.content import (
     world_position_covariances,
 )
 from fgslam.report.formats import read_ply
-from fgslam.report.pictures import FilmCanvas, Moment, PathPicture, RouteCanvas, RouteMoment
+from fgslam.report.overlays import FilmCanvas, Moment
+from fgslam.report.pictures import PathPicture, RouteCanvas, RouteMoment
 from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.config import (
     Experiment,
@@ -71,10 +74,13 @@ def film_of_run(
     taught: Path | None,
     progress: Progress,
     overwrite: bool = False,
+    speed: float = 1.0,
+    width: int = 1280,
 ) -> str:
     """Writes the film of a run, of SLAM or of a route that was followed; a line about it.
 
-    The film runs as fast as the recording, at most 30 frames a second.
+    The film runs ``speed`` times as fast as the recording, with at most 30 frames a second: of a
+    faster one frames are left out.
 
     Args:
         run: what ``fgslam run`` or ``fgslam follow`` wrote.
@@ -83,6 +89,8 @@ def film_of_run(
         taught: what ``fgslam teach`` wrote, for the pictures of path images; None: their features.
         progress: called with what is done, how far, of how much.
         overwrite: replace a file that is there.
+        speed: of the film over the recording's.
+        width: of a frame, pixels.
 
     Raises:
         FgslamError: no run of cameras there, its recording is gone, or the film cannot be written.
@@ -99,18 +107,19 @@ def film_of_run(
         if taught is not None:
             raise ConfigError(f"{run}: no route was followed there; leave out --taught")
         what, (times, frames) = "poses", _film_of_slam(run, estimator)
-    fps = frame_rate(times, what, run)
+    fps = speed / median_step(times, what, run)
+    step = math.ceil(fps / _MOST_FPS)
 
     def counted() -> Iterator[Image]:
-        for done, frame in enumerate(frames, 1):
+        for done, frame in enumerate(islice(frames, 0, None, step)):
             yield frame
-            progress("film", done, len(times))
+            progress("film", min(step * (done + 1), len(times)), len(times))
 
-    return f"{out}: {write_film(out, counted(), fps)} frames"
+    return f"{out}: {write_film(out, counted(), fps / step, width)} frames"
 
 
-def frame_rate(times: FloatArray, what: str, where: Path) -> float:
-    """Frames a second of a film of these times.
+def median_step(times: FloatArray, what: str, where: Path) -> float:
+    """Seconds between two frames of a film of these times.
 
     Raises:
         ConfigError: fewer than two times.
@@ -124,7 +133,7 @@ def frame_rate(times: FloatArray, what: str, where: Path) -> float:
             f"{where}: the times of its {what} do not increase (median step {step:g} s), which "
             "gives no frame rate; run the recording again"
         )
-    return min(_MOST_FPS, 1.0 / step)
+    return step
 
 
 def _readable(read: Callable[[int], Any], number: int) -> Any:

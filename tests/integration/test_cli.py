@@ -311,6 +311,18 @@ def test_film_of_a_run_shows_every_frame(
     assert moved[:, half:].any()  # the map on the right
 
 
+def test_a_faster_film_leaves_out_what_no_screen_shows(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film = tmp_path / "run.mp4"
+    given = ("film", finished.folder, film, "--speed", "30", "--width", "400")
+    assert main(monkeypatch, *given) == 0
+    assert "6 frames" in capfd.readouterr().out
+    shown = cv2.VideoCapture(str(film))
+    assert shown.get(cv2.CAP_PROP_FRAME_WIDTH) == 400
+    assert shown.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0, rel=0.1)
+
+
 def test_mistakes_of_film(
     finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

@@ -39,6 +39,24 @@ def test_gif_is_thinned_to_ten_frames_a_second_and_narrowed(tmp_path: Path) -> N
         assert film.info["duration"] == 100
 
 
+def test_frames_are_brought_to_a_width_and_an_even_height(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write_film(path, greys(3), 10.0, width=101)
+    film = cv2.VideoCapture(str(path))
+    assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 100
+    assert film.get(cv2.CAP_PROP_FRAME_HEIGHT) == 76
+
+
+def test_a_gif_of_noise_is_narrowed_until_it_is_small(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (300, 720, 3), dtype=np.uint8) for _ in range(16)]
+    write_film(tmp_path / "a.gif", noise, 10.0)
+    with Pillow.open(tmp_path / "a.gif") as film:
+        assert film.width < 720
+        assert film.n_frames == 16  # type: ignore[attr-defined]
+    assert (tmp_path / "a.gif").stat().st_size < 3_000_000 or film.width == 360
+
+
 @pytest.mark.parametrize(("name", "frames"), [("a.avi", 3), ("a.mp4", 0), ("a.gif", 0)])
 def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, name: str, frames: int) -> None:
     with pytest.raises(OutputError, match="cannot write"):

@@ -19,8 +19,8 @@ from fgslam.runs.view import (
     Row,
     command_text,
     follow_rows,
-    frame_rate,
     half_axes,
+    median_step,
     seen_pixels,
 )
 
@@ -180,17 +180,15 @@ def test_a_turn_has_a_side_unless_it_is_zero(turn: float, said: str) -> None:
     assert f"omega {said}" in command_text(READ | {"omega_deg_s": turn}).splitlines()
 
 
-def test_a_film_runs_as_fast_as_the_recording_and_at_most_30_frames_a_second() -> None:
+def test_a_film_runs_by_the_median_step_of_the_recording() -> None:
     where = Path("run")
     epoch = 1.7e9 + np.array([0.25, 0.35, 0.45])
-    assert frame_rate(epoch, "images", where) == pytest.approx(10.0, abs=1e-4)
-    assert frame_rate(np.arange(3) / 200.0, "images", where) == 30.0
-
+    assert median_step(epoch, "images", where) == pytest.approx(0.1, abs=1e-5)
     with pytest.raises(ConfigError, match="a film needs two at least"):
-        frame_rate(np.zeros(1), "images", where)
+        median_step(np.zeros(1), "images", where)
 
 
 @pytest.mark.parametrize("times", [[5.0, 5.0, 5.0], [3.0, 2.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
 def test_times_that_stand_still_give_no_rate(times: list[float]) -> None:
     with pytest.raises(DatasetError, match="run: the times of its images do not increase"):
-        frame_rate(np.array(times), "images", Path("run"))
+        median_step(np.array(times), "images", Path("run"))
