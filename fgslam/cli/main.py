@@ -22,6 +22,7 @@ from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import find_experiment, list_experiments
 
 if TYPE_CHECKING:
+    from fgslam.runs.classics import ClassicRow
     from fgslam.runs.config import Experiment
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
@@ -275,7 +276,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     Ctrl-C ends it early; the same command with --resume does what is left.
 
     Args:
-        runs (RUN...): run folders; with --trials one run or experiment
+        runs (RUN...): run folders; with --trials one run or experiment; or graphs, .g2o
         estimators (A,B,C): which ones: kinds, or labels of the run's configuration; default those
             that it compares, else every kind
         overrides (--set A.B=VALUE): override one key of one estimator, estimators.NAME.KEY; with
@@ -287,6 +288,9 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         trials: repeat over so many worlds of noise
         seed: of the first trial; default the configuration's
     """
+    if any(run.suffix == ".g2o" for run in runs):
+        _solve_graphs([str(run) for run in runs], None, estimators)
+        return
     from fgslam.cli.console import show_parts
     from fgslam.runs.compare import Choice, ate_tables, compare_runs
     from fgslam.runs.trials import run_trials
@@ -307,6 +311,50 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     show_all(results, same_with_resume())
     show_parts((), ate_tables(results))
     exit_as(results)
+
+
+def _solve_graphs(names: Sequence[str], steps: int | None, estimators: str | None = None) -> None:
+    from fgslam.cli.console import show_parts
+    from fgslam.runs.classics import (
+        GRAPH_KINDS,
+        NO_GRAPH,
+        classics_notes,
+        classics_table,
+        require_classics,
+        run_classic,
+    )
+
+    kinds = None if estimators is None else estimators.split(",")
+    if refused := sorted(set(kinds or ()) - set(GRAPH_KINDS)):
+        raise ConfigError(f"{refused[0]}: {NO_GRAPH}; give --estimators {','.join(GRAPH_KINDS)}")
+    require_classics(names)
+    rows: list[ClassicRow] = []
+    with under_way() as (progress, _):
+        for k, name in enumerate(names):
+            progress("solving", k, len(names))
+            rows += run_classic(name, steps)
+        progress("solving", len(names), len(names))
+    shown = [one for one in rows if kinds is None or one.estimator in kinds]
+    show_parts((), [classics_table(shown)], [("note", note) for note in classics_notes(shown)])
+
+
+@command(app)
+def classics(
+    names: Annotated[list[str] | None, typer.Argument()] = None, steps: options.AtLeast1 = None
+) -> None:
+    """Run well-known data sets, which come with GTSAM, through the estimators that fit.
+
+    victoria_park, sphere2500, city10000, w10000 by iSAM2 and at once: filters and windows keep no
+    old pose on which an edge could close a loop; kitti00, stereo tracks, by five. ATE and NEES
+    where truth is known, chi-square, CPU of a step. All of them take some minutes.
+
+    Args:
+        names (NAME...): which, or graphs, .g2o; default all
+        steps: only so many steps of each drive
+    """
+    from fgslam.runs.classics import CLASSICS
+
+    _solve_graphs(names or CLASSICS, steps)
 
 
 @command(app)

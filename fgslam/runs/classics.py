@@ -1,0 +1,181 @@
+"""`fgslam classics`: well-known data sets, out of the installed GTSAM, through estimators.
+
+Nothing is downloaded. Graphs, in files of g2o too, are solved by iSAM2 and at once; stereo tracks
+are replayed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.backend.step_graph import (
+    SolvedGraph,
+    motions_chained,
+    read_graph,
+    solve_at_once,
+    solve_by_steps,
+)
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import Trajectory
+from fgslam.datasets.measured import open_stereo_tracks
+from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
+from fgslam.datasets.times import read_table
+from fgslam.evaluation.judging import Truth, judge_answer, judge_replay, lone_answer
+from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.report.content import Column, TextTable
+from fgslam.runs.compare import all_kinds
+from fgslam.runs.results import number_text
+from fgslam.slam.replay import replay
+
+GRAPH_KINDS = ("isam2", "batch")
+NO_GRAPH = "filters and windows keep no old pose on which an edge of a graph could close a loop"
+_TRACKED = ("landmark_kalman", "fixed_lag", "sliding_window", "isam2", "batch")
+
+
+@dataclass(frozen=True, slots=True)
+class ClassicRow:
+    """An estimator on a data set; None where a number cannot be known.
+
+    Attributes:
+        classic, estimator: their names.
+        poses, measurements: how many.
+        ate_m: after SE3 alignment.
+        nees: of the poses, per degree of freedom.
+        chi_square: twice the graph's error.
+        step_ms, worst_ms: CPU of a step, mean and longest; of `batch` of the whole.
+        why: what the truth is, or why it failed.
+    """
+
+    classic: str
+    estimator: str
+    poses: int
+    measurements: int
+    ate_m: float | None = None
+    nees: float | None = None
+    chi_square: float | None = None
+    step_ms: float | None = None
+    worst_ms: float | None = None
+    why: str = ""
+
+
+def _data(name: str) -> Path:
+    found = find_spec("gtsam")
+    if found is None or found.origin is None:
+        raise DatasetError("gtsam is not installed, and the data sets lie inside it; install it")
+    return Path(found.origin).parent / "Data" / name
+
+
+def _sphere() -> FloatArray:
+    return motions_chained(_data("sphere2500_groundtruth.txt"))
+
+
+def _city() -> FloatArray:
+    rows = read_table(_data("ISAM2_GT_city10000.txt"), ("x", "y", "turn")).values
+    return np.array([pose(so3_exp(np.array([0.0, 0.0, t])), np.array([x, y, 0.0]))
+                     for x, y, t in rows])  # fmt: skip
+
+
+_GRAPHS: dict[str, tuple[str, Callable[[], FloatArray] | None]] = {
+    "victoria_park": ("victoria_park.txt", None),
+    "sphere2500": ("sphere2500.txt", _sphere),
+    "city10000": ("T1_city10000_04.txt", _city),
+    "w10000": ("w10000.graph", None),
+}
+CLASSICS = (*_GRAPHS, "kitti00")
+"""Their names."""
+
+
+def require_classics(names: Sequence[str]) -> None:
+    """Raises ConfigError for a name that is neither a classic nor a file."""
+    for name in names:
+        if name not in CLASSICS and not Path(name).is_file():
+            raise ConfigError(f"no classic {name!r}; give {', '.join(CLASSICS)}, or a .g2o file")
+
+
+def run_classic(name: str, steps: int | None = None) -> Iterator[ClassicRow]:
+    """Every estimator that fits, one after the other.
+
+    Args:
+        name: of :data:`CLASSICS`, or the path of a graph: `.g2o`, `.graph`.
+        steps: only so many steps of the drive.
+
+    Raises:
+        DatasetError: a file cannot be read.
+    """
+    if name == "kitti00":
+        yield from _tracks(name, steps)
+        return
+    file, make_truth = _GRAPHS.get(name, (name, None))
+    graph = read_graph(_data(file) if name in _GRAPHS else Path(file)).first(steps)
+    poses = None if make_truth is None else make_truth()
+    truth = None if poses is None else Trajectory(np.arange(len(poses), dtype=np.float64), poses)
+    found = solve_by_steps(graph)
+    for kind, solved in (("isam2", found), ("batch", solve_at_once(graph, found.values))):
+        yield _row(Path(name).name, kind, graph.size, solved, truth)
+
+
+def _row(
+    name: str, kind: str, measurements: int, solved: SolvedGraph, truth: Trajectory | None
+) -> ClassicRow:
+    metrics = judge_answer(lone_answer(solved.estimate), Truth(truth)).metrics
+    times = 1e3 * solved.step_s
+    count = len(solved.estimate.trajectory)
+    return ClassicRow(name, kind, count, measurements, metrics.ate_rmse_m,
+                      metrics.nees_pose_per_dof, solved.chi_square, float(times.mean()),
+                      float(times.max()))  # fmt: skip
+
+
+def _tracks(name: str, steps: int | None) -> Iterator[ClassicRow]:
+    opened = open_stereo_tracks(StereoTracksSettings(stop=steps), ConstantVelocitySettings())
+    count = sum(len(one.observations) for one in opened.log)
+    for kind in _TRACKED:
+        found = replay(opened.log, all_kinds()[kind], EgoMotionSettings())
+        metrics = judge_replay(found, Truth(opened.ground_truth)).metrics
+        times = found.column("update_ms") + found.column("solve_ms")
+        yield ClassicRow(name, kind, len(opened.log), count, metrics.ate_rmse_m,
+                         metrics.nees_pose_per_dof, None, float(times.mean()), float(times.max()),
+                         found.failure)  # fmt: skip
+
+
+def classics_table(rows: Sequence[ClassicRow]) -> TextTable:
+    """The rows to be read."""
+    columns = (
+        Column("poses", "of the drive"),
+        Column("measure-\nments", "edges, sightings"),
+        Column("ATE m", "root mean square position error, SE3 aligned, where truth is known"),
+        Column("NEES", "of the poses per degree of freedom: 1 is right"),
+        Column("chi-square", "of the whole graph at the answer"),
+        Column("ms a step\nmean longest", "CPU; of batch of the whole"),
+    )
+    shown = tuple(
+        (
+            f"{one.classic} {one.estimator}",
+            (
+                f"{one.poses:,}",
+                f"{one.measurements:,}",
+                number_text(one.ate_m, ".3f"),
+                number_text(one.nees),
+                number_text(one.chi_square, ",.2f"),
+                f"{number_text(one.step_ms, ',.2f')} {number_text(one.worst_ms, ',.1f')}",
+            ),
+        )
+        for one in rows
+    )
+    return TextTable("classics", "classic data sets", "data set, estimator", columns, shown)
+
+
+def classics_notes(rows: Sequence[ClassicRow]) -> tuple[str, ...]:
+    """What a reader of the rows must know."""
+    notes = [f"{one.classic} {one.estimator} failed: {one.why}" for one in rows if one.why]
+    if any(one.classic == "kitti00" for one in rows):
+        notes.append("kitti00: the reference poses are estimates from the same images, no truth")
+    if any(one.estimator == "batch" and one.chi_square is not None for one in rows):
+        notes.append(f"graphs: batch begins where isam2 ended; {NO_GRAPH}")
+    return tuple(notes)
