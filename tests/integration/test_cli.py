@@ -317,7 +317,7 @@ def test_a_faster_film_leaves_out_what_no_screen_shows(
     film = tmp_path / "run.mp4"
     given = ("film", finished.folder, film, "--speed", "30", "--width", "400")
     assert main(monkeypatch, *given) == 0
-    assert "6 frames" in capfd.readouterr().out
+    assert "3 frames" in capfd.readouterr().out
     shown = cv2.VideoCapture(str(film))
     assert shown.get(cv2.CAP_PROP_FRAME_WIDTH) == 400
     assert shown.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0, rel=0.1)
