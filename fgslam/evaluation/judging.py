@@ -348,7 +348,7 @@ def _relative(
 
     Of their ``lengths`` alone, too: these need no orientation of the truth.
     """
-    if truth is None:
+    if truth is None or not len(path):  # a bare estimate has no poses on the way
         return {}
     rows, true_rows = associate(path.timestamps, truth.timestamps)
     true = np.full((len(path), 4, 4), np.nan)

@@ -96,6 +96,12 @@ def test_times_and_online_poses_come_from_the_answer() -> None:
     assert np.isnan(table.loc["untimed", "ate_online_m"])
 
 
+def test_a_bare_estimate_has_no_motions_on_the_way() -> None:
+    motions = {1: np.tile(1e-4 * np.eye(6), (39, 1, 1))}
+    found = dataclasses.replace(estimate(0.01), relative=motions, online_relative=motions)
+    assert compare({"bare": found}, loop(40)).loc["bare", "ate_m"] < 0.01
+
+
 def test_without_truth_the_errors_are_not_known() -> None:
     table = compare({"a": estimate(0.1)}, full=True)
     assert np.isnan(table.loc["a", "ate_m"])
