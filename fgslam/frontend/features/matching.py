@@ -50,7 +50,9 @@ def alike(
     """Whether the pairs' scales and orientations agree within the gates (Se et al. 2.2)."""
     a, b = scale
     close = (a <= b * max_scale_ratio) & (b <= a * max_scale_ratio)
-    return np.asarray(close & (np.abs(wrap(orientation[0] - orientation[1])) <= max_angle))
+    turned = wrap(orientation[0][close] - orientation[1][close])
+    close[close] = np.abs(turned) <= max_angle
+    return np.asarray(close)
 
 
 def resembling(

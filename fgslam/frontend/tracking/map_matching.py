@@ -74,10 +74,13 @@ class MapMatcher:
     def _match_within(
         self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
     ) -> MapMatches:
-        i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
-        for axis in (0, 2, 1):  # the column leaves the fewest pairs to the others
-            offset = np.abs(features.measurement[j, axis] - expected.measurement[i, axis])
-            near = offset <= reach[i, axis]
+        # Images are wide: the column leaves the fewest pairs to the others.
+        there, seen, far = (
+            np.ascontiguousarray(one.T) for one in (expected.measurement, features.measurement, reach)
+        )
+        i, j = pairs_within(there[0], far[0], seen[0])
+        for axis in (1, 2, 0):
+            near = np.abs(seen[axis].take(j) - there[axis].take(i)) <= far[axis].take(i)
             if axis == 2:
                 near |= measures_one_image(features.measurement_covariance)[j]
             i, j = i[near], j[near]
