@@ -7,6 +7,7 @@ partner is ambiguous. Two-camera rigs use the same code without the last step.
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from typing import TypeAlias
 
 import cv2
@@ -36,6 +37,7 @@ Linear: TypeAlias = tuple[FloatArray, FloatArray]
 
 _SCALE_RATIO = 1.5  # of partners' scales, at most: one level in IJRR 2002
 _ORIENTATION = np.deg2rad(20.0)  # difference of partners' orientations, at most (IJRR 2002)
+_FINE_IMAGES = 6  # of the frame and the one before
 _DISPARITY_AGREEMENT_PX = 1.0  # between horizontal and vertical disparity, at most (IJRR 2002)
 
 
@@ -53,6 +55,18 @@ class StereoMatcher:
         paper = settings.measurement == "paper"
         ratio = self._vertical_to_horizontal
         self._map = measurement_map("paper", rig.cameras, ratio) if paper else rig_map(rig)
+        self._fine: deque[FineImage] = deque(maxlen=_FINE_IMAGES)
+
+    def fine(self, image: Image) -> FineImage:
+        """The image with values between its pixels, which are found once for all who ask.
+
+        A frame's image is one array from beginning to end, and the next frame's is another.
+        """
+        known = next((one for one in tuple(self._fine) if one.image is image), None)
+        if known is None:
+            known = FineImage(image)
+            self._fine.append(known)
+        return known
 
     def match(
         self, features: tuple[Features, ...], correction: RigCorrection | None = None
@@ -318,7 +332,7 @@ class PatchStereo:
         coarse = self._coarse(frame.images, found.xy)
         known = np.isfinite(coarse)
         found, coarse = found.select(known), coarse[known]
-        views = [FineImage(image) for image in frame.images]
+        views = [self._stereo.fine(image) for image in frame.images]
         pixels = np.empty((len(found.xy), len(frame.images), 2))
         good: BoolArray = np.empty(len(found.xy), np.bool_)
         for first in range(0, len(found.xy), _AT_ONCE):
@@ -410,7 +424,7 @@ class RigStereo:
 
         ``by_patches``: whether the latter is asked whatever images have features.
         """
-        self._matcher = matcher
+        self.matcher = matcher
         self.alone = matcher.alone
         self._patches = patches
         self._by_patches = by_patches
@@ -432,4 +446,4 @@ class RigStereo:
             return StereoFeatures.empty()
         if frame is not None and (self._by_patches or len(features) == 1):
             return self._patches.match(frame, features[0], correction)
-        return self._matcher.match_all(features, correction)
+        return self.matcher.match_all(features, correction)

@@ -91,8 +91,9 @@ def make_pipeline(
         take_over(estimator, arrival)
         tracker.database.load(arrival.saved)
         tracker.keeps_map = not arrival.extends
+    stereo = make_stereo(rig, frontend)
     return SlamPipeline(
-        stereo=make_stereo(rig, frontend),
+        stereo=stereo,
         tracker=tracker,
         motion=make_motion(rig, odometry),
         estimator=estimator,
@@ -100,7 +101,7 @@ def make_pipeline(
             rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
         ),
         calibration=make_calibration(rig, frontend, memory),
-        key_frames=make_key_frames(rig, frontend, tracker),
+        key_frames=make_key_frames(rig, frontend, tracker, stereo.matcher),
         stated=np.zeros(len(term_names(rig))) if of_depth else None,
         watch=CameraWatch(rig) if frontend.watch_cameras and not of_depth else None,
         located=prior if arrival is not None and arrival.relocalised else None,
@@ -222,14 +223,9 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
 
 def make_stereo(rig: CameraRig, settings: FrontendSettings) -> RigStereo:
     """What measures a frame's features in all images of the rig."""
-    matcher = make_stereo_matcher(rig, settings)
+    matcher = StereoMatcher(as_measured(rig, settings), settings.stereo, settings.appearance)
     patches = PatchStereo(rig, matcher, settings.stereo.largest_disparity_px)
     return RigStereo(matcher, patches, settings.stereo.by_patches(rig.cameras))
-
-
-def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
-    """Stereo matcher of the rig, for features of all images."""
-    return StereoMatcher(as_measured(rig, settings), settings.stereo, settings.appearance)
 
 
 def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:
@@ -317,12 +313,12 @@ def has_depth_camera(settings: FrontendSettings) -> bool:
 
 
 def make_key_frames(
-    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker
+    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, matcher: StereoMatcher
 ) -> KeyFrameTracker | None:
     """Tracking between key frames; None where every frame is one."""
     if settings.tracking == "sift":
         return None
-    return KeyFrameTracker(tracker, LandmarkCarrier(rig, make_stereo_matcher(rig, settings)))
+    return KeyFrameTracker(tracker, LandmarkCarrier(rig, matcher))
 
 
 def make_stream(

@@ -136,7 +136,7 @@ class KeyFrameTracker:
         that error in every frame to come, as if all of them had seen it.
         """
         database, old = self._tracker.database, points.select(~new)
-        begun = Begun.new(self._carrier.reference(image), points.select(new))
+        begun = Begun.new(self._carrier.fine(image), points.select(new))
         database.keep_patches(begun.points.ids, begun.patches(image))
         begun = begun.join(Begun.again(old, database.patches(old.ids)))
         return begun.select(np.argsort(begun.points.ids))
@@ -281,6 +281,7 @@ class LandmarkCarrier:
         """Carries nothing yet; ``stereo`` measures, by its gates."""
         self._rig = rig
         self._stereo = stereo
+        self.fine = stereo.fine
         self._last = None
         self._points = Points.none()
         self._patches = ReferencePatches.none(PATCH_PX)
@@ -291,15 +292,6 @@ class LandmarkCarrier:
         """(n,) landmarks with a patch, ascending."""
         return np.union1d(self._points.ids, self._fresh.points.ids)
 
-    def reference(self, image: Image) -> FineImage:
-        """The image as the last reference: that of the frame which was followed, if it is the same.
-
-        A frame's image is one array from beginning to end, and the next frame's is another.
-        """
-        if self._last is None or self._last.image is not image:
-            self._last = FineImage(image)
-        return self._last
-
     def begin(self, image: Image, begun: Begun) -> None:
         """Landmarks seen in the reference image are carried from here, in place of older ones.
 
@@ -307,7 +299,7 @@ class LandmarkCarrier:
         costs nothing.
         """
         self._keep(~np.isin(self._points.ids, begun.points.ids))
-        self._last, self._fresh = self.reference(image), begun
+        self._last, self._fresh = self._stereo.fine(image), begun
 
     def forget(self, ids: IntArray) -> None:
         """Carries these no further."""
@@ -328,7 +320,7 @@ class LandmarkCarrier:
             expected: landmarks of the map where the predicted pose expects them.
             correction: of the rig; None where its calibration is taken as stated.
         """
-        last, now = self._last, FineImage(images[0])
+        last, now = self._last, self._stereo.fine(images[0])
         self._last = now
         self._keep(np.isin(self._points.ids, expected.ids))
         self._fresh = self._fresh.select(np.isin(self._fresh.points.ids, expected.ids))
@@ -349,7 +341,12 @@ class LandmarkCarrier:
         pixels = [places]
         for camera in range(1, len(images)):
             seen, alike = across(
-                self._rig, FineImage(images[camera]), camera, patches, places, predicted[:, 2]
+                self._rig,
+                self._stereo.fine(images[camera]),
+                camera,
+                patches,
+                places,
+                predicted[:, 2],
             )
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION

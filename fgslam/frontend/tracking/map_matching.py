@@ -76,7 +76,8 @@ class MapMatcher:
     ) -> MapMatches:
         # Images are wide: the column leaves the fewest pairs to the others.
         there, seen, far = (
-            np.ascontiguousarray(one.T) for one in (expected.measurement, features.measurement, reach)
+            np.ascontiguousarray(one.T)
+            for one in (expected.measurement, features.measurement, reach)
         )
         i, j = pairs_within(there[0], far[0], seen[0])
         for axis in (1, 2, 0):
