@@ -474,7 +474,8 @@ SENTENCES = {
     "images show): give the pose now in the frame before, not its inverse",
     "odometry_scaled": _ODOMETRY + "its ways are {ratio:.2f} +- {scatter:.2f} of those that images "
     "show (wheel radius, unit)",
-    "odometry_slips": _ODOMETRY + "images show other ways, by no fixed factor (the wheels slip, "
+    "odometry_slips": _ODOMETRY
+    + "images show other ways, by no factor that stays (the wheels slip, "
     "its clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
     "odometry_stuck": _ODOMETRY + "it states no motion while images show one",
     "other_motion": "in {count} frames, {span}, something else moves rigidly, with up to "

@@ -106,7 +106,8 @@ class SlamPipeline:
         frame = self._check_cameras(frame, index, body)  # late, frozen, swapped images are not used
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
-        carried = self._track_patches(prediction, frame, landmarks)  # between key frames
+        around = self.witnesses.widened(prediction)
+        carried = self._track_patches(around, frame, landmarks)  # between key frames
         if self.key_frames and carried and self._needs_no_features(carried, odometry, prediction):
             stereo, features = carried.carried.features, None
             matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
@@ -236,7 +237,8 @@ class SlamPipeline:
         self, now: Frame, frame: FeatureFrame, carried: CarriedFrame | None
     ) -> tuple[StereoFeatures, Matched]:
         """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
-        prediction, landmarks, stereo = now.prediction, now.landmarks, now.features
+        prediction, landmarks = self.witnesses.widened(now.prediction), now.landmarks
+        stereo = now.features
         if frame.frame is None or frame.frame.alone is not None:
             if by_one := self._track_alone(now, frame):
                 return stereo, by_one

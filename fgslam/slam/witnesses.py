@@ -83,6 +83,8 @@ class Witnesses:
     found: Kept[list[Contradiction]]
     _agreeing: Kept[int]
     _other: Kept[Apart | None]
+    _erred: Kept[FloatArray]
+    _agreed_m: Kept[float]
     _relative: Kept[FloatArray]
     _proofs: Kept[Proofs]
     _body: Kept[ByteArray]
@@ -95,6 +97,8 @@ class Witnesses:
         self.score, self.apart, self.found = [], [], []
         self._agreeing = _ENDS
         self._other = None  # of the last frame
+        self._erred = np.zeros(6)  # odometry, where the images contradicted it last
+        self._agreed_m = 0.0  # way since then
         self._relative = np.zeros((6, 6))  # covariance of the last pose, relative to its landmarks
         self._proofs = Proofs.none()
         self._body, self._seen = np.empty((0, 128), np.uint8), np.empty(0, np.int64)
@@ -112,6 +116,16 @@ class Witnesses:
         if self._other is not None or tracking.status is EgoMotionStatus.CAPPED:
             return True
         return self._squared(step, prediction, tracking) > _GATE
+
+    def widened(self, prediction: Prediction) -> Prediction:
+        """The prediction, as uncertain as odometry errs while images are decided to be right.
+
+        Else it would pull a frame of few matches along, which then seems to agree.
+        """
+        if self._other is None or self.score[-1] >= -_DECIDED:
+            return prediction
+        errs = np.outer(self._erred, self._erred)
+        return Prediction(prediction.wTc, prediction.covariance + errs)
 
     def judge(self, frame: Frame, tracked: Tracked) -> Judged:
         """The frame as it is to be taken in.
@@ -176,6 +190,8 @@ class Witnesses:
                 spread = compose_covariance(step.motion, self._other.covariance, step.covariance)
                 self._other = replace(self._other, row=self._rows, iTo=there, covariance=spread)
                 self.apart.append(self._other)
+        if step is not None and self._agreeing:
+            self._agreed_m += float(np.linalg.norm(step.motion[:3, 3]))
         if self._agreeing >= _ENDS:
             self._other = None
             seen = increment.kept
@@ -381,6 +397,8 @@ class Witnesses:
         self, frame: Frame, images: EgoMotion, odometry: Odometrys, verdict: Verdict
     ) -> None:
         """Books a contradicted frame, for the cause that is named."""
+        self._erred = se3_log(inverse(frame.prediction.wTc) @ images.wTc)
+        self._agreed_m = 0.0
         before = frame.prediction.wTc @ inverse(frame.step.motion)
         columns = frame.features.measurement[odometry.features, 0] / self._tracker.rig.width
         left, right = np.percentile(columns, (5.0, 95.0)) if len(columns) else (0.0, 0.0)
@@ -503,7 +521,7 @@ class Witnesses:
         repeats = [one for one in by["odometry"] if one.repeats]
         bodies = [one for one in by["odometry"] if not one.repeats]
         named: tuple[tuple[list[Contradiction], _Cause], ...] = (
-            (by["images"], _odometry_errs(by["images"])),
+            (by["images"], _odometry_errs(by["images"], self._agreed_m)),
             (repeats, ("scene_repeats", {})),
             (bodies, _body_moves(bodies)),
             (by["undecided"], ("witnesses_undecided", {})),
@@ -527,8 +545,11 @@ _Cause: TypeAlias = tuple[str, dict[str, float | str]]
 """Code and values of a remark."""
 
 
-def _odometry_errs(frames: Sequence[Contradiction]) -> _Cause:
-    """How odometry errs where images are right: by a factor, not at all moving, or by slipping."""
+def _odometry_errs(frames: Sequence[Contradiction], agreed_m: float) -> _Cause:
+    """How odometry errs where images are right: by a factor, not at all moving, or by slipping.
+
+    A wrong factor stays: what agrees again, over some way, has slipped.
+    """
     if not frames:
         return "", {}
     seen = np.array([one.by_images for one in frames])
@@ -540,6 +561,8 @@ def _odometry_errs(frames: Sequence[Contradiction]) -> _Cause:
         return "odometry_slips", {}
     if abs(ratio) < _STUCK:
         return "odometry_stuck", {}
+    if ratio > 0.0 and agreed_m > _ENDS * float(np.median(np.linalg.norm(seen, axis=1))):
+        return "odometry_slips", {}
     code = "odometry_reversed" if ratio < 0.0 else "odometry_scaled"
     return code, {"ratio": ratio, "scatter": scatter}
 
