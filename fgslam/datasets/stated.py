@@ -98,10 +98,10 @@ def read_stated(source: str | Path, covariance: Path | None = None) -> StatedPos
 def _of_text(path: Path) -> StatedPoses:
     table, head = _numbers(path, (_POSE, _EUROC, *(_POSE + n for n in _SIZES)), _POSES)
     values = table.values
-    if bad := next((k for k in range(len(values)) if not np.isfinite(values[k, :_POSE]).all()), 0):
-        raise DatasetError(
-            f"{path}, line {table.lines[bad]}: a pose is not finite; remove the line"
-        )
+    bad = np.flatnonzero(~np.isfinite(values[:, :_POSE]).all(axis=1))
+    if len(bad):
+        line = table.lines[bad[0]]
+        raise DatasetError(f"{path}, line {line}: a pose is not finite; remove the line")
     unit, seconds = time_unit(values[:, 0])
     times = seconds * values[:, 0]
     require_increasing(table, times)

@@ -156,6 +156,7 @@ WHOLE = covariances().reshape(-1, 36)
         ((ROWS, spoilt(WHOLE, (4, 1), 9.0)), "line 5: the covariance is not symmetric"),
         ((2.0 * ROWS,), "the quaternion has length 2"),
         ((spoilt(ROWS, (3, 0), np.nan),), "line 4: a pose is not finite"),
+        ((spoilt(ROWS, (0, 0), np.nan),), "line 1: a pose is not finite"),
     ],
 )
 def test_what_cannot_be_read_is_named_with_its_line(
