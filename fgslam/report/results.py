@@ -15,6 +15,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
+    Nees,
     chi_square_band,
     evaluate_trajectory,
     judge,
@@ -236,10 +237,7 @@ def _against_truth(
     per_dof = np.full(len(rows), np.nan)
     values[rows] = np.divide(found.values, found.dof, out=per_dof, where=found.dof > 0)
     usual = np.bincount(found.dof[found.dof > 0])
-    later = rows[1:]  # the first pose is the gauge
-    judged = judge(
-        [pose_nees(report.final_poses[later], report.covariances[later], true_poses[1:])]
-    )
+    judged = judge([Nees(found.values[1:], found.dof[1:])])  # the first pose is the gauge
     aligned = evaluate_trajectory(report.final, truth, Alignment.SE3)
     return replace(
         report,
@@ -249,7 +247,7 @@ def _against_truth(
         nees_band=chi_square_band(float(usual.argmax())) if len(usual) else None,
         ate_m=aligned.ate_rmse_m,
         matched_poses=aligned.matched_poses,
-        judged_poses=len(later),
+        judged_poses=len(rows) - 1,
         nees_per_dof=None if judged is None else judged.per_dof,
         verdict=None if judged is None else judged.verdict,
     )

@@ -146,7 +146,7 @@ def judge(
             estimate, by = _halves(name, run)
             notes.append(_HALVES)
         else:
-            by = _of_same_frame(name, stated, true, run)
+            by = _of_same_frame(name, stated, true)
             space, estimate, found = _in_world_of(name, stated, words, by)
             notes += [*stated.notes, *found]
             about = {"tangent": str(space), "guessed": any("(guess: " in note for note in found)}
@@ -226,12 +226,9 @@ def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Pat
     return read_stated(path, covariance), (run, path.parent.name) if is_run_folder(run) else None
 
 
-def _of_same_frame(
-    name: str, stated: StatedPoses, truth: StatedPoses, run: tuple[Path, str] | None
-) -> Trajectory:
+def _of_same_frame(name: str, stated: StatedPoses, truth: StatedPoses) -> Trajectory:
     """The truth as poses of what the estimate is of. Raises DatasetError: other times or frames."""
-    path, frame = stated.trajectory, stated.trajectory.frame
-    known = truth.trajectory
+    path, known = stated.trajectory, truth.trajectory
     rows, _ = associate(path.timestamps, known.timestamps)
     if len(rows) < 3:
         spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (path.timestamps, known.timestamps)]
@@ -239,14 +236,12 @@ def _of_same_frame(
             f"{name}: from {spans[0]}, the truth from {spans[1]}: {len(rows)} poses have a true "
             f"one within {SAME_TIME_S:g} s; give both the times of one clock"
         )
-    if not (truth.frame_stated and stated.frame_stated) or known.frame == frame:
-        return replace(known, frame=frame)
-    if run is None:
+    if truth.frame_stated and stated.frame_stated and known.frame != path.frame:
         raise DatasetError(
             f"{name}: {path.named}, and the truth {known.named}; give both of one frame: fgslam "
             "export RUN --trajectory FILE --frame left|right|body"
         )
-    return known.of(frame, MeasurementLog.load(run[0] / LOG_FILE).rig)
+    return replace(known, frame=path.frame)
 
 
 def _in_world_of(
