@@ -28,7 +28,13 @@ from fgslam.evaluation.credibility import (
     turned_axes,
 )
 from fgslam.evaluation.judging import Truth, judge_answer, lone_answer
-from fgslam.evaluation.statistics import SAME_TIME_S, associate, to_estimate_world, value_at
+from fgslam.evaluation.statistics import (
+    SAME_TIME_S,
+    associate,
+    best_aligned,
+    to_estimate_world,
+    value_at,
+)
 from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import TextTable, read_metrics, write_json
 from fgslam.report.results import NO_LANDMARKS, ReportData, judged_report
@@ -54,6 +60,8 @@ _ACCUMULATED = (
     "motions: no joint covariances are known; as in dead reckoning, what is added on the way is "
     "taken as independent of what was before"
 )
+_EXACT = 1e-6  # of the usual variance
+_UNCERTAIN = "its first pose is uncertain, so the truth is aligned where the NEES is least"
 _HALVES = (
     "no truth: two halves of the landmarks, each replayed alone, are held against each other and "
     "the sum of their covariances; what both share cancels, as errors of odometry and calibration, "
@@ -154,6 +162,8 @@ def judge(
             about |= {"nees_relative": joint} if joint else {}
             notes.append(_JOINT if joint else _ACCUMULATED)
         values[name] = _numbers(estimate, by, space.split) | about
+        if values[name]["aligned"] == "best":
+            notes.append(f"{name}: {_UNCERTAIN}")
         estimated[name], truths[name] = estimate, by
     return JudgedEstimates(values, tuple(dict.fromkeys(notes)), estimated, truths)
 
@@ -295,10 +305,14 @@ def _joint(run: tuple[Path, str] | None, truth: Any) -> Any:
 def _numbers(estimate: Estimate, truth: Trajectory, split: bool) -> dict[str, Any]:
     path, sound = estimate.trajectory, sound_truth(estimate.trajectory, truth).trajectory
     rows, true = to_estimate_world(path, sound or truth) or (np.empty(0, int), np.empty((0, 4, 4)))
-    later = rows[1:]  # the first is aligned
-    judged = credibility(path.poses[later], estimate.covariances[later], true[1:], split)
+    poses, covariances = path.poses[rows], estimate.covariances[rows]
+    sizes = np.trace(covariances, axis1=1, axis2=2)
+    exact = int(not sizes[0] > _EXACT * np.nanmedian(sizes))  # then it is the gauge, and no error
+    if not exact:
+        true = best_aligned(poses, covariances, true)
+    judged = credibility(poses[exact:], covariances[exact:], true[exact:], split)
     metrics = judge_answer(lone_answer(estimate), Truth(truth)).metrics.as_json()
-    return metrics | asdict(judged)
+    return metrics | asdict(judged) | {"aligned": "first_pose" if exact else "best"}
 
 
 def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajectory]:

@@ -92,6 +92,17 @@ def test_a_robot_s_axes_are_taken_as_such_and_the_numbers_stay() -> None:
     )
 
 
+def test_an_uncertain_first_pose_is_no_gauge() -> None:
+    """Its own error, passed on to all, would make a right covariance look overconfident."""
+    errors = SIGMA * np.random.default_rng(5).normal(size=(FRAMES, 6))
+    errors[0] = 3.0 * SIGMA
+    poses = TRUTH.poses @ np.array([se3_exp(-e) for e in errors])
+    stated = np.tile(np.diag(SIGMA**2), (FRAMES, 1, 1))
+    judged = fg.judge((Trajectory(TRUTH.timestamps, poses), stated), TRUTH)
+    assert judged.table().loc["estimate", "nees_pose"] == pytest.approx(1.0, abs=0.15)
+    assert any("its first pose is uncertain" in note for note in judged.notes)
+
+
 def test_degrees_are_refused_and_accepted_as_told(tmp_path: Path, truth: Path) -> None:
     scale = np.repeat([np.degrees(1.0), 1.0], 3)
     file = written(tmp_path / "vio.txt", covariances() * np.outer(scale, scale))
