@@ -56,6 +56,7 @@ from fgslam.datasets.images import (
     DepthLoader,
     bits_held,
     both_views,
+    images_of_cameras,
     mosaic_note,
     require_size,
     shown_together,
@@ -149,7 +150,9 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
                 place = int(places[index, 0])
                 shown = require_size(bag.image(place, colour), f"message {place}", *whole)
                 return rig.rectified(both_views(shown, size))
-            return rig.rectified(tuple(image(place, colour) for place in places[index].tolist()))
+            return images_of_cameras(
+                lambda place: image(place, colour), places[index].tolist(), rig
+            )
 
     recording = image_recording(
         settings,

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -73,24 +73,42 @@ def open_frames(
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
         read = read_colour_image if colour else read_grey_image
-        images, faults = {}, []
-        for camera, path in enumerate(paths[index]):
-            try:
-                images[camera] = require_size(read(path, bits), f"image {path}", *size)
-            except FrameError as error:
-                faults.append(error)
-        if faults and not images:
-            raise faults[0]
-        first = min(images)
-        black = np.zeros_like(images[first])
-        filled = rig.rectified(tuple(images.get(k, black) for k in range(len(paths[index]))))
-        if faults:
-            fault = OneImageError(str(faults[0]))
-            fault.frame = filled, first
-            raise fault
-        return filled
+        return images_of_cameras(
+            lambda path: require_size(read(path, bits), f"image {path}", *size), paths[index], rig
+        )
 
     return load, tuple(notes)
+
+
+_Place = TypeVar("_Place", Path, int)
+
+
+def images_of_cameras(
+    read: Callable[[_Place], Image], places: Sequence[_Place], rig: StereoRig
+) -> tuple[Image, ...]:
+    """The rectified images of a frame, by what reads one and where those of its cameras are.
+
+    Raises:
+        OneImageError: some cannot be read; its frame is all, with black ones in place of those, and
+            the first camera whose own is there.
+        FrameError: none can be read.
+    """
+    images, faults = {}, []
+    for camera, place in enumerate(places):
+        try:
+            images[camera] = read(place)
+        except FrameError as error:
+            faults.append(error)
+    if faults and not images:
+        raise faults[0]
+    first = min(images)
+    black = np.zeros_like(images[first])
+    filled = rig.rectified(tuple(images.get(k, black) for k in range(len(places))))
+    if faults:
+        fault = OneImageError(str(faults[0]))
+        fault.frame = filled, first
+        raise fault
+    return filled
 
 
 def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:

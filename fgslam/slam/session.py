@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Condition
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +55,8 @@ from fgslam.slam.results import (
 if TYPE_CHECKING:
     from fgslam.slam.rig_memory import RigMemory
 
-Images: TypeAlias = Sequence[npt.ArrayLike]
-"""Images (left, right[, top]) of one instant."""
+Images: TypeAlias = Sequence[npt.ArrayLike | None]
+"""Images (left, right[, top]) of one instant; None where one is missing."""
 
 
 class Session:
@@ -158,8 +158,9 @@ class Session:
             images: (left, right) or (left, right, top), taken at the same moment and rectified, or
                 raw where the rig was loaded with its rectification:
                 (height, width) grey or (height, width, 3) red, green, blue; uint8, or uint16 of
-                which the upper eight bits count; any memory layout. None where the cameras gave
-                nothing: the frame is then placed by the odometry alone.
+                which the upper eight bits count; any memory layout. None in place of one that is
+                missing: the frame is located by the other; None for all of them where the cameras
+                gave nothing: it is then placed by the odometry alone.
             odometry: motion of the robot's body since the last frame: a (4, 4) pose of the body now
                 in its frame before, metres, with the noise of the odometry settings; or an
                 :class:`Odometry` with its own covariance. None where none was measured: constant
@@ -177,8 +178,9 @@ class Session:
         i = self._left_out.count if self._start is not None else len(self.recorder)
         timestamp = later_time(t, self._last_time(), "session", FrameError)
         body = checked_odometry(odometry, self._odometry) if i else None
+        images, alone = _completed(images, self.rig)
         checked = None if images is None else checked_images(images, self.rig)
-        frame = None if checked is None else Frame(i, timestamp, checked, self._margins)
+        frame = None if checked is None else Frame(i, timestamp, checked, self._margins, alone)
         with one_blas_thread():
             bare = undescribed(i, frame)
             every = self.frontend.tracking == "sift"
@@ -411,7 +413,24 @@ def checked_extractor(features: FeatureExtractor | None) -> FeatureExtractor | N
     return features
 
 
-def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
+def _completed(
+    images: Images | None, rig: CameraRig
+) -> tuple[Sequence[npt.ArrayLike] | None, int | None]:
+    """Images with black ones in place of missing ones, and the camera whose image is left.
+
+    None for images that are all missing; no camera where none is.
+    """
+    if not isinstance(images, tuple | list) or not any(one is None for one in images):
+        return cast("Sequence[npt.ArrayLike] | None", images), None
+    there = [k for k in (1, 0, 2)[: len(images)] if images[k] is not None]
+    if not there:
+        return None, None
+    black = np.zeros(_size(rig)[::-1], np.uint8)
+    full = [black if one is None else one for one in images]
+    return full, (1, 0, 2)[there[0]]  # the rig's order is right, left, top
+
+
+def checked_images(images: Sequence[npt.ArrayLike], rig: CameraRig) -> tuple[Image, ...]:
     """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
 
     Copies: tracking needs the last images again, and a camera loop may fill the same ones again.
@@ -437,7 +456,7 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
             f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted})"
             f"{other.get(given, '')}"
         )
-    grey, size = [], rig.image_size if isinstance(rig, StereoRig) else (rig.width, rig.height)
+    grey, size = [], _size(rig)
     for name, image in zip(_NAMES, images, strict=False):
         converted = grey_image(image, f"{name} image")
         if converted.shape[::-1] != size:
@@ -450,6 +469,11 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     left, right, *top = grey
     inside = (right, left, *top)
     return rig.rectified(inside) if isinstance(rig, StereoRig) else inside
+
+
+def _size(rig: CameraRig) -> tuple[int, int]:
+    """Width and height of the images that are given."""
+    return rig.image_size if isinstance(rig, StereoRig) else (rig.width, rig.height)
 
 
 def _is_colour(image: np.ndarray) -> bool:

@@ -31,7 +31,13 @@ from bags import (
 from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibration
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
+from fgslam.core.errors import (
+    CalibrationError,
+    DatasetError,
+    FrameError,
+    OdometryError,
+    OneImageError,
+)
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD
 from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.datasets.depth import BASELINE_M
@@ -501,6 +507,27 @@ def test_the_messages_before_a_damage_are_used(tmp_path: Path, kind: str) -> Non
     assert 30 < len(recording) < 120
     assert "messages before the damage are used" in recording.notes[0]
     assert recording.frame(len(recording) - 1).images[0].shape == (1875, WIDTH)
+
+
+@pytest.mark.parametrize(("side", "left_over"), [("left", 0), ("right", 1)])
+def test_a_damaged_image_leaves_the_other_one_of_its_frame(
+    tmp_path: Path, side: str, left_over: int
+) -> None:
+    messages = [
+        (topic, stamp, name, {**fields, "data": fields["data"][:9]})
+        if f"{side}/image" in topic and stamp == START_NS + 2 * PERIOD_NS
+        else (topic, stamp, name, fields)
+        for topic, stamp, name, fields in stereo(4)
+    ]
+    recording = opened(write_bag(tmp_path / "walk.bag", messages))
+    whole = opened(write_bag(tmp_path / "whole.bag", stereo(4)))
+    with pytest.raises(OneImageError, match=f"/cam/{side}/image_raw") as caught:
+        recording.frame(2)
+    frame = caught.value.frame
+    assert frame.alone == left_over
+    np.testing.assert_array_equal(frame.images[left_over], whole.frame(2).images[left_over])
+    assert not frame.images[1 - left_over].any()
+    assert len(recording.frame(3).images) == 2
 
 
 def test_what_is_no_bag_is_refused_in_one_line(tmp_path: Path, ending: str) -> None:

@@ -229,6 +229,21 @@ def test_a_frame_without_images_is_placed_by_odometry(views: Views) -> None:
     assert slam.track(2.0, views.images(4), views.odometry(4)).status is EgoMotionStatus.OK
 
 
+@pytest.mark.parametrize("there", [(0,), (1, 2), (0, 2)])
+def test_a_frame_that_lacks_an_image_is_located_by_another(
+    views: Views, there: tuple[int, ...]
+) -> None:
+    slam = session(views)
+    push(slam, views, range(3))
+    images = [image if k in there else None for k, image in enumerate(views.images(3))]
+    step = slam.track(1.5, images, views.odometry(3))
+    assert step.status is EgoMotionStatus.ONE_IMAGE
+    expected = g.inverse(views.poses[0]) @ views.poses[3]
+    np.testing.assert_allclose(step.wTc[:3, 3], expected[:3, 3], rtol=0, atol=0.05)
+    none = slam.track(2.0, [None, None, None], views.odometry(4))
+    assert none.status is EgoMotionStatus.NO_IMAGE
+
+
 def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
     """Tracking compares with the last images: they are not those that were given."""
     buffers = views.images(0)
