@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.settings import KernelSettings
-from fgslam.backend.smoothers.bundle import PLAIN, State, WholeGraph
+from fgslam.backend.smoothers.bundle import PLAIN, Sightings, State, WholeGraph
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.landmark import FROM_MEASUREMENT
 from fgslam.factors.noise import plain
@@ -34,5 +34,5 @@ def in_arrays(graph: Any, values: Any, kernel: KernelSettings = PLAIN) -> tuple[
     if stereo:
         k = stereo[0].calibration()
         rig = CameraRig(0, 0, k.fx(), k.fy(), k.px(), k.py(), k.baseline(), None, np.eye(4))
-    numbers = measured, roots @ FROM_MEASUREMENT
-    return WholeGraph.of(others, values, kernel, (keys[:, 0], keys[:, 1]), numbers, rig)
+    sightings = Sightings(keys[:, 0], keys[:, 1], measured, roots @ FROM_MEASUREMENT, rig)
+    return WholeGraph.of(others, values, kernel, sightings)

@@ -30,9 +30,10 @@ if TYPE_CHECKING:
     from fgslam.cameras.rig import StereoRig, load_rig
     from fgslam.core.bearings import Refusal, TwoViewVector
     from fgslam.core.log import MeasurementLog
-    from fgslam.core.sensors import Odometry
+    from fgslam.core.sensors import Increment, Measured, Odometry
     from fgslam.core.types import Features, Trajectory
     from fgslam.evaluation.judging import compare
+    from fgslam.factors.measurement import LandmarkModel, PoseModel
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.route import PathMemory
     from fgslam.homing.steering import DriveCommand
@@ -53,13 +54,17 @@ __all__ = [
     "FeatureExtractor",
     "Features",
     "HomingVector",
+    "Increment",
+    "LandmarkModel",
     "Map",
+    "Measured",
     "MeasurementLog",
     "MotionModel",
     "NewestFrame",
     "Odometry",
     "PathFollower",
     "PathMemory",
+    "PoseModel",
     "Refusal",
     "Result",
     "RigMemory",
@@ -90,13 +95,17 @@ _HOMES = {
     "FeatureExtractor": "fgslam.slam.feature_stream",
     "Features": "fgslam.core.types",
     "HomingVector": "fgslam.homing.api",
+    "Increment": "fgslam.core.sensors",
+    "LandmarkModel": "fgslam.factors.measurement",
     "Map": "fgslam.runs.session",
+    "Measured": "fgslam.core.sensors",
     "MeasurementLog": "fgslam.core.log",
     "MotionModel": "fgslam.slam.motion",
     "NewestFrame": "fgslam.slam.session",
     "Odometry": "fgslam.core.sensors",
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.route",
+    "PoseModel": "fgslam.factors.measurement",
     "Refusal": "fgslam.core.bearings",
     "Result": "fgslam.runs.session",
     "RigMemory": "fgslam.slam.rig_memory",

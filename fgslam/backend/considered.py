@@ -63,6 +63,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.store import Kept
 from fgslam.core.types import LAGS, EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
+from fgslam.factors.measurement import LinearRows
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 
@@ -581,6 +582,43 @@ class SampledErrors(ErrorColumns):
                 columns.placed(self._pose_columns) - before
             )
 
+    def correct(
+        self, gain: FloatArray, rows: LinearRows, ids: IntArray, noise: FloatArray
+    ) -> FloatArray:
+        """The pose corrected by another sensor's measurements (k, m), of known landmarks or none.
+
+        Args:
+            gain: (6, km).
+            rows: the measurements, linearised.
+            ids: (k,) the landmarks; none of a pose.
+            noise: (k, m, m) of the measurements.
+
+        Returns:
+            (k, m, c) samples of their errors.
+        """
+        drawn = np.zeros((*rows.residual.shape, self._pose_columns.shape[1]))
+        if not self._off:
+            drawn[..., self._count :] = self._drawn(noise)
+            off = rows.by_pose @ self._pose_columns - drawn
+            off += rows.by_point @ self._of_map(ids) if len(ids) else 0.0
+            self._pose_columns = self._pose_columns - gain @ off.reshape(gain.shape[1], -1)
+        return drawn
+
+    def pull(self, gain: FloatArray, rows: LinearRows, ids: IntArray, drawn: FloatArray) -> None:
+        """The landmarks of the same measurements follow them, by gains (k, 3, m)."""
+        if not self._off:
+            columns = self._of_map(ids)
+            off = rows.by_pose @ self._pose_columns + rows.by_point @ columns - drawn
+            at, known = self.rows(ids)
+            self._map["columns"][at[known]] = (columns - gain @ off)[known]
+
+    def begin(self, ids: IntArray, by_pose: FloatArray, covariances: FloatArray) -> None:
+        """New landmarks (k,): world points by the pose (k, 3, 6), and their own errors."""
+        if not self._off:
+            columns = by_pose @ self._pose_columns
+            columns[..., self._count :] += self._drawn(covariances)
+            self.append({"ids": ids, "columns": columns})
+
     def add(self, ids: IntArray, placed: PoseProblem, wTc: FloatArray) -> None:
         """New landmarks, where the frame at ``wTc`` has them."""
         if not self._off:
@@ -698,9 +736,10 @@ class SampledErrors(ErrorColumns):
         return np.asarray(2.0 * np.unpackbits(bits).reshape(k, d, SAMPLES) - 1.0)
 
     def _drawn(self, covariances: FloatArray) -> FloatArray:
-        """Samples (k, 3, SAMPLES) of these covariances (k, 3, 3)."""
-        definite = covariances + lacking(covariances)
-        return np.asarray(np.linalg.cholesky(definite) @ self._signs(len(covariances), 3))
+        """Samples (k, m, SAMPLES) of these covariances (k, m, m)."""
+        k, m = covariances.shape[:2]
+        definite = covariances + lacking(covariances) if m == 3 else covariances
+        return np.asarray(np.linalg.cholesky(definite) @ self._signs(k, m))
 
     def _enter(
         self, ids: IntArray, columns: ObservedColumns, covariances: FloatArray, pose: FloatArray

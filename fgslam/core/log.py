@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, get_args, runtime_checkable
 
@@ -19,6 +18,7 @@ from fgslam.core.errors import DatasetError, MeasurementLogError
 from fgslam.core.files import write_text
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import (
+    NO_CAMERA,
     CameraRig,
     Increment,
     LoopClosure,
@@ -35,14 +35,14 @@ class MeasurementLog(Brief):
     """Measurements of a run, frame by frame.
 
     Attributes:
-        rig: the cameras, with the lever arm.
+        rig: the cameras, with the lever arm; left out for a robot without.
         motion_model: how odometry came about, plain JSON values; where there was none, replays
             predict by constant velocity as the live run did.
         increments: one a frame, time increasing.
     """
 
-    rig: CameraRig
-    motion_model: dict[str, Any]
+    rig: CameraRig = NO_CAMERA
+    motion_model: dict[str, Any] = field(default_factory=dict)
     increments: list[Increment] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -61,7 +61,7 @@ class MeasurementLog(Brief):
                 f"frame {increment.index}: time stamp {increment.timestamp:.9f} s does not come "
                 f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
             )
-        increment = dataclasses.replace(increment, odometry=_without_stand_in(increment.odometry))
+        increment = replace(increment, odometry=_without_stand_in(increment.odometry))
         self.increments.append(increment)
 
     @property
@@ -89,9 +89,17 @@ class MeasurementLog(Brief):
         LOG.save(path, self)
 
     @staticmethod
-    def load(path: str | Path) -> MeasurementLog:
-        """Reads a log. Raises MeasurementLogError for a missing, truncated or foreign file."""
-        return LOG.load(path)
+    def load(path: str | Path, models: Iterable[Any] = ()) -> MeasurementLog:
+        """Reads a log; ``models`` are those of its other sensors, by kind, which files do not hold.
+
+        Raises MeasurementLogError for a missing, truncated or foreign file.
+        """
+        log, of_kind = LOG.load(path), {model.kind: model for model in models}
+        for k, step in enumerate(log.increments):
+            if step.measured:
+                every = [replace(one, model=of_kind.get(one.kind)) for one in step.measured]
+                log.increments[k] = replace(step, measured=tuple(every))
+        return log
 
 
 def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
@@ -122,6 +130,9 @@ def _require_measured(log: MeasurementLog) -> None:
                 f"a loop closure of frame {k} leads to frame {forward[0]}, which does not come "
                 "before it"
             )
+        for one in step.measured:
+            require_finite(one.kind, one.values)
+            require_covariances(one.kind, one.covariance)
         if step.rig_correction is not None and step.rig_correction.shape != (terms,):
             raise ValueError(f"frame {step.index}: rig_correction has not {terms} terms")
         field_px = 0.0 if step.settled_rig is None else step.settled_rig.field_px

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import lru_cache
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -127,6 +127,33 @@ class Observations(Rows):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Measured(Rows):
+    """What a frame's other sensors measured, by one model (``model.measured(...)`` makes it).
+
+    Attributes:
+        kind: the model's.
+        values: (k, m).
+        covariance: (k, m, m) of them.
+        ids: (k,) landmark identities, unique, numbered together with the camera's; none of a pose.
+        model: that predicts them (:class:`fgslam.LandmarkModel`, :class:`fgslam.PoseModel`); files
+            hold none.
+    """
+
+    SHARED = frozenset({"kind", "model"})
+
+    kind: str
+    values: FloatArray
+    covariance: FloatArray
+    ids: IntArray
+    model: Any = field(default=None, metadata={"stored": False})
+
+    @property
+    def of_pose(self) -> bool:
+        """Whether the robot's pose alone was measured."""
+        return len(self.ids) < len(self.values)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoopClosure(Brief):
     """A place seen again: the frame sees landmarks of an earlier frame, under new identities.
 
@@ -186,6 +213,7 @@ class Increment(Brief):
             off the raw pixels; None where the calibration was taken as it is.
         settled_rig: since when the rig is so, and what the correction leaves, as known then; None
             where the calibration was taken as it is.
+        measured: by other sensors, one item a kind.
     """
 
     index: int
@@ -199,6 +227,19 @@ class Increment(Brief):
     relocalised: bool = False
     rig_correction: FloatArray | None = None
     settled_rig: SettledRig | None = None
+    measured: tuple[Measured, ...] = field(default=(), metadata={"sparse": True})
+
+    @staticmethod
+    def of(
+        index: int, timestamp: float, odometry: Odometry | None, measured: Iterable[Measured] = ()
+    ) -> Increment:
+        """A frame of a robot without cameras, or of which they saw nothing."""
+        none = np.empty(0, np.int64)
+        numbers = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 2))
+        seen = Observations(none, *numbers, none.astype(np.bool_))
+        return Increment(
+            index, timestamp, odometry, seen, seen.is_new, none, none, measured=tuple(measured)
+        )
 
     @property
     def rig_since(self) -> int:
@@ -347,6 +388,9 @@ class CameraRig(Brief):
         jacobian[:, 2, 2] = -fx * baseline / d**2
         return congruence(jacobian, covariance)
 
+
+NO_CAMERA = CameraRig(640, 480, 500.0, 500.0, 319.5, 239.5, 0.1, None, np.eye(4), exact=True)
+"""Stands for the rig of a robot without: its poses are those of the body."""
 
 CAMERA_NAMES = ("right", "left", "top")
 """Of a rig's cameras in their order, the reference first."""

@@ -131,7 +131,8 @@ class _Packing:
         names = kept or _field_names(kind)
         if not names:
             raise TypeError(f"{kind.__name__} cannot be stored")
-        columns = {n: self.column([getattr(v, n) for v in values], _below(at, n)) for n in names}
+        given = (n for n in names if n not in _sparse(kind) or any(getattr(v, n) for v in values))
+        columns = {n: self.column([getattr(v, n) for v in values], _below(at, n)) for n in given}
         return {"part": columns} if kept else {"class": kind.__name__, "columns": columns}
 
     def containers(self, values: list[Any], kind: Any, at: str) -> Any:
@@ -364,6 +365,13 @@ def _field_names(kind: Any) -> tuple[str, ...]:
         fields = dataclasses.fields(kind)
         return tuple(f.name for f in fields if f.init and f.metadata.get("stored", True))
     return tuple(getattr(kind, "_fields", ()))
+
+
+@cache
+def _sparse(kind: Any) -> frozenset[str]:
+    """Fields that are stored only where one value has something in them."""
+    fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    return frozenset(f.name for f in fields if f.metadata.get("sparse"))
 
 
 def from_upper(upper: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:

@@ -12,10 +12,12 @@ from typing import Any, ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, Rows
+from fgslam.core.errors import MeasurementLogError
 from fgslam.core.geometry import adjoint, inverse, se3_exp, skew, transform_to_camera, wrap
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Measured
 
 _STEP = 6e-6  # of a central difference: the third root of the rounding, where both errors are least
 
@@ -38,6 +40,39 @@ class MeasurementModel:
     def __init__(self, bTs: FloatArray | None = None) -> None:
         """``bTs`` left out: the sensor's frame is the body's."""
         self.bTs = np.eye(4) if bTs is None else np.asarray(bTs, np.float64)
+
+    def measured(
+        self, values: npt.ArrayLike, covariance: npt.ArrayLike, ids: npt.ArrayLike = ()
+    ) -> Measured:
+        """What a frame measured.
+
+        Args:
+            values: (k, m).
+            covariance: (m, m) of each, or (k, m, m).
+            ids: (k,) identities of the landmarks; none for a model of poses.
+
+        Raises:
+            MeasurementLogError: the shapes do not fit, a number is not finite, or a covariance is
+                not positive definite.
+        """
+        given, m = np.atleast_2d(np.asarray(values, np.float64)), self.size
+        k, noise = len(given), np.asarray(covariance, np.float64)
+        wanted = 0 if isinstance(self, PoseModel) else k
+        if len(np.unique(ids)) != wanted or np.size(ids) != wanted:
+            raise MeasurementLogError(f"{self.kind}: give {wanted} different ids for {k} values")
+        if given.shape != (k, m) or noise.shape not in ((m, m), (k, m, m)):
+            raise MeasurementLogError(
+                f"{self.kind}: values {given.shape} with covariance {noise.shape}; give (k, {m}) "
+                f"and ({m}, {m}) or (k, {m}, {m})"
+            )
+        if not np.isfinite(given).all() or not (np.linalg.eigvalsh(noise) > 0.0).all():
+            raise MeasurementLogError(
+                f"{self.kind}: a value is not finite or a covariance not positive definite; leave "
+                "out what was not measured"
+            )
+        which = np.asarray(ids, np.int64).reshape(-1)
+        noise = np.broadcast_to(noise, (k, m, m)).copy()
+        return Measured(self.kind, given, noise, which, self)
 
     def predict(self, x: FloatArray) -> FloatArray:
         """(k, m) expected; NaN in a row that cannot be predicted."""

@@ -24,6 +24,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
+from fgslam.backend.measured import Waiting, linearised, require_model
 from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.errors import EstimatorError
@@ -43,13 +44,14 @@ from fgslam.core.sensors import (
     CameraRig,
     Increment,
     LoopClosure,
+    Measured,
     MeasurementType,
     Observations,
     Odometry,
 )
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, Estimate, Floor, LandmarkMap, Prediction, UpdateStats
-from fgslam.factors.measurement import linearise
+from fgslam.factors.measurement import LinearRows, linearise, products, whitening
 
 FRONT = 6
 """The pose's rows and columns come first."""
@@ -68,7 +70,7 @@ def correct(
     covariance: GrowingCovariance,
     front: FloatArray,
     matches: Matches,
-    floor: FloorMeasurement,
+    floor: PoseMeasurement,
     gate_sigmas: float,
 ) -> Correction:
     """One Kalman correction by all matches within the gate, and the floor, at once.
@@ -89,7 +91,7 @@ def correct(
     """
     cross, innovation_covariance = _with_landmarks(covariance, front, matches)
     kept = _within_gate(matches, innovation_covariance, gate_sigmas)
-    rows = np.flatnonzero(np.repeat(kept, 3))
+    rows = np.flatnonzero(np.repeat(kept, matches.innovation.shape[1]))
     cross, s = cross[:, rows], innovation_covariance[np.ix_(rows, rows)]
     innovation = np.concatenate([matches.innovation[kept].ravel(), floor.innovation])
     cross, s = _with_floor(cross, s, front, floor)
@@ -109,33 +111,33 @@ def correct(
 def _with_landmarks(
     covariance: GrowingCovariance, front: FloatArray, matches: Matches
 ) -> tuple[FloatArray, FloatArray]:
-    """``P H^T`` (n, 3k) and ``H P H^T + R`` (3k, 3k) of the matches."""
-    n, k = len(front), len(matches)
+    """``P H^T`` (n, km) and ``H P H^T + R`` (km, km) of the matches."""
+    n, (k, m) = len(front), matches.innovation.shape
     rows = rows_of(matches.blocks)
     columns = covariance.columns(rows.ravel())
     columns[:FRONT] = front[rows.ravel()].T
     by_block = columns.reshape(n, k, 3).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
     by_pose = matches.by_pose.reshape(-1, FRONT)
-    cross = by_block.swapaxes(0, 1).reshape(n, 3 * k) + front @ by_pose.T
-    s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(3 * k, 3 * k)
+    cross = by_block.swapaxes(0, 1).reshape(n, m * k) + front @ by_pose.T
+    s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(m * k, m * k)
     s = 0.5 * (s + s.T)
-    s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] += matches.noise
+    s.reshape(k, m, k, m)[np.arange(k), :, np.arange(k)] += matches.noise
     return cross, s
 
 
 def _within_gate(matches: Matches, s: FloatArray, gate_sigmas: float) -> BoolArray:
     """Mask (k,) of matches whose own innovation is within the gate of its own covariance."""
-    k = len(matches)
+    k, m = matches.innovation.shape
     if gate_sigmas == 0.0 or not k:
         return np.ones(k, np.bool_)
-    own = s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    own = s.reshape(k, m, k, m)[np.arange(k), :, np.arange(k)]
     roots = _root(own, "an innovation's covariance")
     whitened = np.linalg.solve(roots, matches.innovation[:, :, None])[:, :, 0]
     return np.asarray((whitened**2).sum(axis=1) <= gate_sigmas**2)
 
 
 def _with_floor(
-    cross: FloatArray, s: FloatArray, front: FloatArray, floor: FloorMeasurement
+    cross: FloatArray, s: FloatArray, front: FloatArray, floor: PoseMeasurement
 ) -> tuple[FloatArray, FloatArray]:
     """The same with the floor's rows after the matches'."""
     if not len(floor.innovation):
@@ -192,9 +194,8 @@ def correct_iterated(
     """
     front = covariance.front()
     step = np.zeros(len(front))
-    nowhere = FloorMeasurement(np.empty(0), np.empty((0, FRONT)), np.empty(0))
     for _ in range(_ITERATIONS):
-        found = correct(covariance, front, matches_at(step), nowhere, gate_sigmas=0.0)
+        found = correct(covariance, front, matches_at(step), NOTHING, gate_sigmas=0.0)
         if fixed:
             found = found.of_the_pose_alone()
         change = float(np.abs(found.step - step).max())
@@ -223,6 +224,7 @@ class FullEkf:
     _skipped: Kept[int]
     _remarks: Kept[list[str]]
     _considered: Kept[ConsiderCovariance]
+    _waiting: Kept[Waiting]
 
     def __init__(
         self, sensor: CameraRig, settings: EkfSettings, floor: Floor, prior: Prediction
@@ -237,6 +239,7 @@ class FullEkf:
         self._positions = np.empty((0, 3))
         self._past = FilteredTrajectory()
         self._considered = ConsiderCovariance(sensor, floor)
+        self._waiting = Waiting()
         self._matched = self._gated = self._skipped = 0
         self._remarks = []
         self._map: LandmarkMap | None = None
@@ -282,9 +285,13 @@ class FullEkf:
         self._gated += found.matched - found.nis_dof // BLOCK
         left_out = len(increment.observations) - found.matched - len(first[0])
         self._skipped += left_out - int(merged.sum())
+        for one in increment.measured:
+            self._correct_by(one, increment.index)
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         self._drop(increment)
-        self._add(*first)
+        self._add(first[0].ids, *first[1:])
+        for one in increment.measured:
+            self._begin(one, increment.index)
         self._considered.observe(increment, self._wTc)
         current = self._considered.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
         self._past.append(increment.timestamp, current)
@@ -341,14 +348,45 @@ class FullEkf:
         seen = seen.select(np.isin(seen.ids, self._ids))
         blocks = self._blocks(seen.ids)
         matches = Matches.of(self._sensor, wTc, blocks, self._positions[blocks], seen)
-        floor = FloorMeasurement.of(self._floor, wTc)
+        floor = PoseMeasurement.of_floor(self._floor, wTc)
+        return self._corrected(increment.index, front, matches, floor)
+
+    def _corrected(
+        self, index: int, front: FloatArray, matches: Matches, of_pose: PoseMeasurement
+    ) -> Correction:
         try:
-            return correct(self._covariance, front, matches, floor, self._settings.gate_sigmas)
+            return correct(self._covariance, front, matches, of_pose, self._settings.gate_sigmas)
         except DivergedError as cause:
             raise EstimatorError(
-                f"frame {increment.index}: the ekf has diverged: {cause}; use isam2, which "
+                f"frame {index}: the ekf has diverged: {cause}; use isam2, which "
                 "relinearises, or state the odometry's and the measurements' noise larger"
             ) from None
+
+    def _correct_by(self, one: Measured, index: int) -> None:
+        """Corrects by what another sensor measured, of the pose or of known landmarks."""
+        require_model(one, index)
+        matches, of_pose = Matches.none(), NOTHING
+        if one.of_pose:
+            of_pose = PoseMeasurement.of(linearised(self._sensor, one, self._wTc), one.covariance)
+        else:
+            one = one.select(np.isin(one.ids, self._ids))
+            blocks = self._blocks(one.ids)
+            rows = linearised(self._sensor, one, self._wTc, self._positions[blocks])
+            matches = Matches.usable(rows, blocks, one.covariance)
+        front = self._covariance.front()
+        found = self._corrected(index, front, matches, of_pose)
+        self._apply(found.of_the_pose_alone() if self._fixed else found, self._wTc, front)
+        self._matched += found.matched
+        self._gated += found.matched - found.nis_dof // one.values.shape[1]
+
+    def _begin(self, one: Measured, index: int) -> None:
+        """Landmarks that another sensor's measurements give a place now."""
+        if not one.of_pose:
+            pose = Prediction(self._wTc, self._covariance.front()[:FRONT])
+            begun = self._waiting.begin(self._sensor, one, pose, self._ids)
+            self._require_space(f"frame {index}", len(self._ids) + len(begun.ids))
+            self._add(begun.ids, begun.points, begun.covariances)
+            self._correct_by(begun.later, index)
 
     def _close(self, increment: Increment, loop: LoopClosure) -> bool:
         """Corrects by the old landmarks seen again; refused where the covariance rules it out."""
@@ -418,7 +456,7 @@ class FullEkf:
             remaining = self._covariance.drop(gone)
             self._ids, self._positions = self._ids[remaining], self._positions[remaining]
 
-    def _add(self, observed: Observations, points: FloatArray, covariances: FloatArray) -> None:
+    def _add(self, ids: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """New landmarks, correlated with all there is through the pose they were seen from."""
         if not len(points):
             return
@@ -430,7 +468,7 @@ class FullEkf:
         at = BLOCK * np.arange(len(own))[:, None] + np.arange(BLOCK)
         square[at[:, :, None], at[:, None, :]] += own
         self._covariance.append(front @ flat.T, square)
-        self._ids = np.concatenate([self._ids, observed.ids])
+        self._ids = np.concatenate([self._ids, ids])
         positions = transform_to_world(self._wTc, points)
         self._positions = np.concatenate([self._positions, positions])
 
@@ -510,10 +548,10 @@ class Matches(Rows):
 
     Attributes:
         blocks: (k,) landmark blocks of the covariance.
-        innovation: (k, 3) measured less expected.
-        by_pose: (k, 3, 6) d(measurement)/d(tangent of the pose).
-        by_landmark: (k, 3, 3) d(measurement)/d(position in the world).
-        noise: (k, 3, 3) covariance of the measurement.
+        innovation: (k, m) measured less expected.
+        by_pose: (k, m, 6) d(measurement)/d(tangent of the pose).
+        by_landmark: (k, m, 3) d(measurement)/d(position in the world).
+        noise: (k, m, m) covariance of the measurement.
     """
 
     blocks: IntArray
@@ -521,6 +559,12 @@ class Matches(Rows):
     by_pose: FloatArray
     by_landmark: FloatArray
     noise: FloatArray
+
+    @staticmethod
+    def none() -> Matches:
+        """No match."""
+        none = np.empty(0, np.int64)
+        return Matches(none, np.empty((0, 1)), *(np.empty((0, 1, n)) for n in (6, 3, 1)))
 
     @staticmethod
     def of(
@@ -532,19 +576,21 @@ class Matches(Rows):
     ) -> Matches:
         """Linearises at the landmarks' positions (k, 3); those not before the sensor drop out."""
         rows = linearise(sensor, wTc, positions, observed.measurement)
-        matches = Matches(blocks, -rows.residual, rows.by_pose, rows.by_point, observed.covariance)
+        return Matches.usable(rows, blocks, observed.covariance)
+
+    @staticmethod
+    def usable(rows: LinearRows, blocks: IntArray, noise: FloatArray) -> Matches:
+        """Of measurements linearised at a pose (k,), those that can be predicted."""
+        matches = Matches(blocks, -rows.residual, rows.by_pose, rows.by_point, noise)
         return matches.select(rows.usable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FloorMeasurement:
-    """A soft floor as a measurement of the pose, which is zero up to the floor's deviations.
-
-    Height along the vertical, and for 3 degrees of freedom the tilt about the nearest upright
-    rotation, as the graphs' floor factors have it.
+class PoseMeasurement:
+    """What is measured of the pose alone, linearised at it.
 
     Attributes:
-        innovation: (m,) metres, radians; m is 0 without a soft floor, else 1 or 3.
+        innovation: (m,) measured less expected.
         jacobian: (m, 6) by the tangent of the pose.
         variance: (m,) of it.
     """
@@ -554,26 +600,41 @@ class FloorMeasurement:
     variance: FloatArray
 
     @staticmethod
-    def of(floor: Floor, wTc: FloatArray) -> FloorMeasurement:
-        """At a predicted pose."""
+    def of(rows: LinearRows, noise: FloatArray) -> PoseMeasurement:
+        """Of measurements of a pose with covariances (k, m, m)."""
+        roots = whitening(noise)
+        by_pose = (roots @ rows.by_pose).reshape(-1, FRONT)
+        innovation = -products(roots, rows.residual).ravel()
+        return PoseMeasurement(innovation, by_pose, np.ones(len(innovation)))
+
+    @staticmethod
+    def of_floor(floor: Floor, wTc: FloatArray) -> PoseMeasurement:
+        """A soft floor at a predicted pose: zero up to the floor's deviations.
+
+        Height along the vertical, and for 3 degrees of freedom the tilt about the nearest upright
+        rotation, as the graphs' floor factors have it.
+        """
         if floor.hard or floor.dof == 6:
-            return FloorMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
+            return NOTHING
         height, by_height = floor.down @ wTc[:3, 3], np.zeros((1, 6))
         by_height[0, 3:] = floor.down @ wTc[:3, :3]
         variance = np.array([floor.height_sigma_m**2])
         if floor.dof == 5:
-            return FloorMeasurement(np.array([-height]), by_height, variance)
+            return PoseMeasurement(np.array([-height]), by_height, variance)
         upright = floor.constrain(wTc)[:3, :3]
         turned = np.zeros(6)
         turned[:3] = so3_log(upright.T @ wTc[:3, :3])
         axes = floor.horizontal.T @ upright
         by_tilt = np.zeros((2, 6))
         by_tilt[:, :3] = axes @ se3_log_jacobian(turned)[:3, :3]
-        return FloorMeasurement(
+        return PoseMeasurement(
             np.array([-height, *(-axes @ turned[:3])]),
             np.concatenate([by_height, by_tilt]),
             np.array([*variance, *[floor.tilt_sigma_rad**2] * 2]),
         )
+
+
+NOTHING = PoseMeasurement(np.empty(0), np.empty((0, FRONT)), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

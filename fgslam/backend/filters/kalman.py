@@ -13,6 +13,7 @@ to the poses that saw it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -24,6 +25,7 @@ from fgslam.backend.filters.landmark_update import (
     Landmarks,
     UpdateKind,
     average_weight,
+    kalman_update,
 )
 from fgslam.backend.loops import (
     Chain,
@@ -35,15 +37,25 @@ from fgslam.backend.loops import (
     starts_new_part,
     transported,
 )
+from fgslam.backend.measured import Waiting, linearised, require_model
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import PerLandmarkSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
-from fgslam.core.geometry import inverse, inverse_spd3
+from fgslam.core.geometry import (
+    block_diagonal,
+    congruence,
+    inverse,
+    inverse_spd3,
+    moved_apart,
+    point_pose_jacobian,
+    transform_to_world,
+)
 from fgslam.core.sensors import (
     CameraRig,
     Increment,
     LoopClosure,
+    Measured,
     MeasurementType,
     Observations,
     Odometry,
@@ -67,6 +79,7 @@ class LandmarkKalman:
     _drive: Kept[DriveRecord]
     _errors: Kept[SampledErrors]
     _applied: Kept[FloatArray]
+    _waiting: Kept[Waiting]
 
     def __init__(
         self,
@@ -94,6 +107,7 @@ class LandmarkKalman:
         self._drive = DriveRecord()
         solver = EgoMotionSolver(rig, ego_motion or EgoMotionSettings())
         self._errors = SampledErrors(solver, off=ego_motion is None)
+        self._floor, self._waiting = solver.floor, Waiting()
         self._fixed = False
         self._applied = np.empty(0)  # correction of the rig in the last frame
 
@@ -115,15 +129,21 @@ class LandmarkKalman:
         step = self._step(increment, tracking)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
-        # With the stated noise, like all that landmarks are weighed by.
-        self._by_pose = tracking.covariance / tracking.noise if shared else None
         new = increment.observations.is_new
         used = increment.observations.select(~new).select(tracking.inliers)
         self._errors.track(step, used, self._rows.map())
+        for one in increment.measured:
+            require_model(one, increment.index)
+            self._measure(one)
+        tracking = replace(tracking, wTc=self._current.wTc, covariance=self._current.covariance)
+        # With the stated noise, like all that landmarks are weighed by.
+        self._by_pose = tracking.covariance / tracking.noise if shared else None
         nis = self._update_matched(used)  # type III
         missed = self._rows.rows(increment.missed_ids)  # type II
         self._rows.covariances[missed] += self._settings.miss_growth_m**2 * np.eye(3)
         self._add(increment.observations.select(new), len(self._past))  # type IV
+        for one in increment.measured:
+            self._begin(one)
         self._record(increment, tracking, step.before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._errors.forget(increment.pruned_ids)
@@ -173,6 +193,49 @@ class LandmarkKalman:
         self._rows.add(observed.ids, positions, covariances, frame)
         placed = PoseProblem(positions, covariances, observed.measurement, observed.covariance)
         self._errors.add(observed.ids, placed, self._current.wTc)
+
+    def _measure(self, one: Measured) -> None:
+        """The pose, then known landmarks, by what another sensor measured of them."""
+        held, before = self._rows, self._current
+        one = one if one.of_pose else one.select(np.isin(one.ids, held.ids))
+        if not len(one):
+            return
+        at = held.rows(one.ids)
+        known = Landmarks(held.positions[at], held.covariances[at])
+        rows = linearised(self._rig, one, before.wTc, None if one.of_pose else known.positions)
+        noise = one.covariance
+        if not one.of_pose:
+            noise = noise + congruence(rows.by_point, known.covariances)
+        by_pose = rows.by_pose.reshape(-1, 6)
+        noise = block_diagonal(np.empty((0, 0)), noise)
+        cross = before.covariance @ by_pose.T
+        gain = np.asarray(np.linalg.solve(by_pose @ cross + noise, cross.T).T, np.float64)
+        wTc = self._floor.constrain(moved_apart(before.wTc, -gain @ rows.residual.ravel()))
+        kept = congruence(np.eye(6) - gain @ by_pose, before.covariance)
+        self._current = Prediction(wTc, kept + congruence(gain, noise))
+        drawn = self._errors.correct(gain, rows, one.ids, one.covariance)
+        if not one.of_pose and not self._fixed:
+            rows = linearised(self._rig, one, wTc, known.positions)
+            noise = one.covariance + congruence(rows.by_pose, self._current.covariance)
+            found = kalman_update(known, rows.by_point, -rows.residual, noise)
+            held.positions[at], held.covariances[at] = found.positions, found.covariances
+            held.lasts[at] = len(self._past)
+            held.counts[at] += 1
+            self._errors.pull(np.asarray(found.gain), rows, one.ids, drawn)
+
+    def _begin(self, one: Measured) -> None:
+        """Landmarks that another sensor's measurements give a place now."""
+        if one.of_pose:
+            return
+        pose = self._current
+        begun = self._waiting.begin(self._rig, one, pose, self._rows.ids)
+        turned = congruence(pose.wTc[:3, :3], begun.covariances)
+        by_pose = -pose.wTc[:3, :3] @ point_pose_jacobian(begun.points)
+        own = turned + congruence(by_pose, pose.covariance)
+        positions = transform_to_world(pose.wTc, begun.points)
+        self._rows.add(begun.ids, positions, own, len(self._past))
+        self._errors.begin(begun.ids, by_pose, turned)
+        self._measure(begun.later)
 
     def _record(
         self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray

@@ -21,11 +21,15 @@ UpdateKind: TypeAlias = Literal["pixel", "world", "running_mean", "half"]
 
 
 class Landmarks(NamedTuple):
-    """Matched landmarks: positions (k, 3), covariances (k, 3, 3), innovation squared, summed."""
+    """Matched landmarks: positions (k, 3), covariances (k, 3, 3), innovation squared, summed.
+
+    And the gains (k, 3, m) of the Kalman filters that updated them.
+    """
 
     positions: FloatArray
     covariances: FloatArray
     nis: float = 0.0
+    gain: FloatArray | None = None
 
 
 def kalman_update(
@@ -37,18 +41,19 @@ def kalman_update(
 
     Args:
         known: s and S.
-        jacobian: H (k, 3, 3) of the measurement by the landmark.
-        innovation: v (k, 3), measured less expected.
-        noise: R (k, 3, 3).
+        jacobian: H (k, m, 3) of the measurement by the landmark.
+        innovation: v (k, m), measured less expected.
+        noise: R (k, m, m).
     """
-    before = known.covariances
-    precision = inverse_spd3(congruence(jacobian, before) + noise)
+    before, inverse = known.covariances, inverse_spd3 if noise.shape[1] == 3 else np.linalg.inv
+    precision = inverse(congruence(jacobian, before) + noise)
     gain = before @ np.swapaxes(jacobian, 1, 2) @ precision
     keep = np.eye(3) - gain @ jacobian
     return Landmarks(
         known.positions + np.einsum("kij,kj->ki", gain, innovation),
         congruence(keep, before) + congruence(gain, noise),
         float(np.einsum("ki,kij,kj->", innovation, precision, innovation)),
+        gain,
     )
 
 

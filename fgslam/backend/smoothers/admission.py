@@ -37,6 +37,11 @@ class Sighting:
     measurement: FloatArray
     covariance: FloatArray
 
+    @staticmethod
+    def by_others(frame: int) -> Sighting:
+        """One by another sensor than the camera."""
+        return Sighting(frame, np.full(3, np.nan), np.full((3, 3), np.nan))
+
 
 @dataclass(slots=True, eq=False)
 class Track:
@@ -61,12 +66,18 @@ class Track:
     elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     left_at: tuple[FloatArray, FloatArray] | None = None
 
+    @property
+    def by_camera(self) -> bool:
+        """Whether the camera has seen it."""
+        return bool(np.isfinite(self.last.measurement[0]))
+
 
 class LandmarkAdmission:
     """The landmarks of a run, by identity, and whether the graph holds them.
 
     Attributes:
         tracks: by the landmark's identity.
+        first_frame: of a bounded lag; 0 where there is none.
         remarks: which landmarks started again, in words.
     """
 
@@ -75,7 +86,7 @@ class LandmarkAdmission:
         self._sensor = sensor
         self._settings = settings
         self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self._first_frame = 0
+        self.first_frame = 0
         self.tracks: dict[int, Track] = {}
         self.by_last_sighting: dict[int, Track] = {}
         self.remarks: list[str] = []
@@ -171,8 +182,8 @@ class LandmarkAdmission:
             parallax: its range over the range's standard deviation.
         """
         track = self.tracks[identity]
-        if track.waiting and track.waiting[0].frame < self._first_frame:
-            track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
+        if track.waiting and track.waiting[0].frame < self.first_frame:
+            track.waiting = [s for s in track.waiting if s.frame >= self.first_frame]
         seldom = len(track.waiting) < LEAST_SIGHTINGS
         return identity in self._saved or not (seldom or parallax < track.least_parallax)
 
@@ -210,7 +221,7 @@ class LandmarkAdmission:
         Returns:
             Identity and track of each; it keeps its variable until the caller closes it.
         """
-        self._first_frame = frame
+        self.first_frame = frame
         left = [
             (i, track) for i, track in self.by_last_sighting.items() if track.last.frame < frame
         ]

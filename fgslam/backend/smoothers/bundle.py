@@ -7,7 +7,7 @@ odometry, floor, loops, what is known of single landmarks) stay GTSAM's, which l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from typing import Any
@@ -28,12 +28,18 @@ from fgslam.backend.smoothers.elimination import (
     reduced,
     with_border,
 )
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import Damping, adjoint, compose_covariance, inverse
-from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
+from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.factors.graphs import is_pose, number
-from fgslam.factors.measurement import LinearRows, linearise, residuals, whitening
+from fgslam.factors.measurement import (
+    LinearRows,
+    gtsam_factor,
+    linearise,
+    residuals,
+    whitening,
+)
 from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definite
 
 # ------------------------------------------------------------------------------------------
@@ -41,43 +47,97 @@ from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class Sightings(Rows):
     """Observations of landmarks by one model.
 
     Attributes:
-        model: of the sensor, whose poses are variables.
-        poses: rows (k,) of their poses.
-        points: rows (k,) of their landmarks.
+        poses: keys (k,) of their poses; in a :class:`WholeGraph` their rows.
+        points: of their landmarks, alike.
         measured: (k, m).
         roots: (k, m, m) square roots of their informations.
+        model: of the sensor.
+        xTs: (4, 4) the sensor in the frame of the poses; None where they are its own.
     """
 
-    model: CameraRig
+    SHARED = frozenset({"model", "xTs"})
+
     poses: IntArray
     points: IntArray
     measured: FloatArray
     roots: FloatArray
+    model: Any
+    xTs: FloatArray | None = None
+
+    def at_rows(self, poses: list[int], landmarks: list[int]) -> Sightings:
+        """By rows among these keys, which ascend."""
+        of_pose = np.searchsorted(np.array(poses, np.int64), self.poses)
+        of_landmark = np.searchsorted(np.array(landmarks, np.int64), self.points)
+        return dataclasses.replace(self, poses=of_pose, points=of_landmark)
+
+    def factors(self) -> Any:
+        """A graph of GTSAM's, by keys."""
+        out = gtsam.NonlinearFactorGraph()
+        xTs = np.eye(4) if self.xTs is None else self.xTs
+        for pose, point, z, root in zip(
+            self.poses.tolist(), self.points.tolist(), self.measured, self.roots, strict=True
+        ):
+            noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+            out.add(gtsam_factor(self.model, [pose, point], z, noise, xTs))
+        return out
 
     def of_points(self, kept: BoolArray) -> Sightings:
         """Those of some landmarks, a mask (m,), whose rows are renumbered."""
-        own, number = kept[self.points], np.cumsum(kept) - 1
-        return Sightings(
-            self.model,
-            self.poses[own],
-            number[self.points[own]],
-            self.measured[own],
-            self.roots[own],
-        )
+        own = self.select(kept[self.points])
+        return dataclasses.replace(own, points=(np.cumsum(kept) - 1)[own.points])
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
         """Whitened residuals (k, m) at all poses (n, 4, 4) and points (p, 3)."""
-        own, seen = poses[self.poses], points[self.points]
-        return residuals(self.model, own, seen, self.measured, self.roots)
+        at = poses[self.poses] if self.xTs is None else poses[self.poses] @ self.xTs
+        return residuals(self.model, at, points[self.points], self.measured, self.roots)
 
     def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
         """The same, with derivatives."""
         own, seen = poses[self.poses], points[self.points]
-        return linearise(self.model, own, seen, self.measured, self.roots)
+        return linearise(self.model, own, seen, self.measured, self.roots, self.xTs)
+
+    def incidence(self, n: int, m: int) -> tuple[csr_matrix, csr_matrix]:
+        """(n, k) and (m, k): which observation is which pose's and which landmark's."""
+        every, one = np.arange(len(self)), np.ones(len(self))
+        return (
+            csr_matrix((one, (self.poses, every)), (n, len(self))),
+            csr_matrix((one, (self.points, every)), (m, len(self))),
+        )
+
+    def joined(
+        self,
+        system: LinearSystem,
+        rows: LinearRows,
+        weights: FloatArray,
+        incidence: tuple[csr_matrix, csr_matrix],
+    ) -> LinearSystem:
+        """Normal equations with these, linearised, with weights (k,)."""
+        known = weights[:, None, None] * np.swapaxes(rows.by_pose, 1, 2)  # (k, 6, m)
+        of_point = weights[:, None, None] * np.swapaxes(rows.by_point, 1, 2)
+        poses, points = incidence
+        column = rows.residual[:, :, None]
+        blocks = _summed(poses, known @ rows.by_pose)
+        of_poses = _summed(poses, known @ column).ravel()
+        of_points = _summed(points, of_point @ column).ravel()
+        return dataclasses.replace(
+            system,
+            poses=system.poses + block_diagonal(blocks),
+            coupling=system.coupling + self._coupled(known @ rows.by_point, system),
+            landmarks=system.landmarks + _summed(points, of_point @ rows.by_point),
+            pose_gradient=system.pose_gradient + of_poses,
+            landmark_gradient=system.landmark_gradient + of_points,
+        )
+
+    def _coupled(self, blocks: FloatArray, system: LinearSystem) -> bsr_matrix:
+        """Sparse (6n, 3m) of each observation's block (k, 6, 3)."""
+        n, m = len(system.pose_keys), len(system.landmark_keys)
+        order = np.lexsort((self.points, self.poses))
+        start = np.searchsorted(self.poses[order], np.arange(n + 1))
+        return bsr_matrix((blocks[order], self.points[order], start), (6 * n, 3 * m))
 
 
 def values_of(keys: dict[int, int], poses: FloatArray, points: FloatArray) -> Any:
@@ -321,12 +381,14 @@ class OtherFactors:
         graph: GTSAM's, without empty slots.
         pose_keys, landmark_keys: of all variables, ascending.
         turns: odometry of a gyroscope; None where there is none.
+        measured: landmarks by other sensors than the camera, their noise as stated.
     """
 
     graph: Any
     pose_keys: list[int]
     landmark_keys: list[int]
     turns: Turns | None = None
+    measured: tuple[Sightings, ...] = ()
 
     def plus(self, factor: Any) -> OtherFactors:
         """With one more."""
@@ -341,16 +403,22 @@ class OtherFactors:
             if gone.isdisjoint(self.graph.at(row).keys()):
                 graph.add(self.graph.at(row))
         left = [key for key in self.landmark_keys if key not in gone]
-        return dataclasses.replace(self, graph=graph, landmark_keys=left)
+        kept = np.array([key not in gone for key in self.landmark_keys], np.bool_)
+        measured = tuple(one.of_points(kept) for one in self.measured)
+        return dataclasses.replace(self, graph=graph, landmark_keys=left, measured=measured)
 
     def cost(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> float:
         """Half the sum of squares at poses (n, 4, 4), points (m, 3) and biases (3q,)."""
         cost = float(self.graph.error(values_of(self._rows, poses, points)))
+        cost += 0.5 * sum(float((s.residuals(poses, points) ** 2).sum()) for s in self.measured)
         return cost if self.turns is None else cost + self.turns.cost(poses, bias)
 
     def linear(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> LinearSystem:
         """Their normal equations there."""
         system = self._linear(poses, points)
+        for one in self.measured:
+            rows, incidence = one.look(poses, points), one.incidence(len(poses), len(points))
+            system = one.joined(system, rows, np.ones(len(one)), incidence)
         return system if self.turns is None else self.turns.joined(system, poses, bias)
 
     @cached_property
@@ -460,28 +528,23 @@ class WholeGraph:
         others: Any,
         values: Any,
         kernel: KernelSettings,
-        keys: tuple[IntArray, IntArray],
-        measured: tuple[FloatArray, FloatArray],
-        rig: CameraRig,
+        seen: Sightings,
+        measured: Iterable[Sightings] = (),
     ) -> tuple[WholeGraph, State]:
-        """Observations of a rig, and other factors.
+        """Observations, and other factors.
 
         Args:
             others: GTSAM's, without empty slots.
             values: of all variables.
-            kernel: around each observation.
-            keys: (k,) of the observations' poses and landmarks.
-            measured: (k, 3) column, row, disparity, and (k, 3, 3) roots of their information.
-            rig: the cameras.
+            kernel: around each of the camera's observations.
+            seen: these.
+            measured: those of other sensors.
         """
-        poses, landmarks = keys_of(values)
-        of_pose, of_landmark = (
-            np.searchsorted(np.array(have, np.int64), which).astype(np.int64)
-            for have, which in zip((poses, landmarks), keys, strict=True)
-        )
-        seen = Sightings(rig, of_pose, of_landmark, *measured) if len(of_pose) else None
-        rest = OtherFactors(others, poses, landmarks)
-        graph = WholeGraph(poses, landmarks, seen, np.ones(len(of_pose)), rest, kernel)
+        keys = poses, landmarks = keys_of(values)
+        found = seen.at_rows(*keys) if len(seen) else None
+        more = tuple(one.at_rows(*keys) for one in measured)
+        rest = OtherFactors(others, poses, landmarks, measured=more)
+        graph = WholeGraph(poses, landmarks, found, np.ones(len(seen)), rest, kernel)
         return graph, State.of(values)
 
     def with_turns(
@@ -526,7 +589,8 @@ class WholeGraph:
 
     def unseen(self) -> IntArray:
         """Rows of the landmarks of which no observation counts."""
-        return np.setdiff1d(np.arange(len(self.landmark_keys)), self._points[self.weights > 0.0])
+        seen = [self._points[self.weights > 0.0], *(one.points for one in self.rest.measured)]
+        return np.setdiff1d(np.arange(len(self.landmark_keys)), np.concatenate(seen))
 
     # -- at a state ------------------------------------------------------------------------------
 
@@ -554,22 +618,9 @@ class WholeGraph:
         if self.seen is None:
             return rest
         rows = self.seen.look(state.poses, state.points)
-        residual, by_pose, by_point = rows.residual, rows.by_pose, rows.by_point
-        squared = self.weights * np.einsum("ki,ki->k", residual, residual)
+        squared = self.weights * np.einsum("ki,ki->k", rows.residual, rows.residual)
         weights = self.weights * kernel_weights(self.kernel.name, self.kernel.width, squared)
-        known = weights[:, None, None] * np.swapaxes(by_pose, 1, 2)  # (k, 6, 3)
-        of_point = weights[:, None, None] * np.swapaxes(by_point, 1, 2)
-        poses, points = self._incidence
-        column = residual[:, :, None]
-        blocks = _summed(poses, known @ by_pose)
-        return dataclasses.replace(
-            rest,
-            poses=rest.poses + block_diagonal(blocks),
-            coupling=rest.coupling + self._coupled(known @ by_point),
-            landmarks=rest.landmarks + _summed(points, of_point @ by_point),
-            pose_gradient=rest.pose_gradient + _summed(poses, known @ column).ravel(),
-            landmark_gradient=rest.landmark_gradient + _summed(points, of_point @ column).ravel(),
-        )
+        return self.seen.joined(rest, rows, weights, self._incidence)
 
     def pulled(
         self, state: State, shifts: Callable[[FloatArray], FloatArray]
@@ -587,7 +638,7 @@ class WholeGraph:
         if seen is None:
             raise ValueError("without observations there is nothing to shift")
         rows, parts = seen.look(state.poses, state.points), []
-        for few in np.array_split(np.arange(len(seen.poses)), len(seen.poses) // _AT_ONCE + 1):
+        for few in np.array_split(np.arange(len(seen)), len(seen) // _AT_ONCE + 1):
             by = -seen.roots[few] @ shifts(seen.measured[few])
             known = self.weights[few, None, None] * by
             poses, points = (which[:, few] for which in self._incidence)
@@ -631,31 +682,16 @@ class WholeGraph:
     # -- its parts -------------------------------------------------------------------------------
 
     @cached_property
-    def _poses(self) -> IntArray:
-        """(k,) rows of the observations' poses."""
-        return _NONE if self.seen is None else self.seen.poses
-
-    @cached_property
     def _points(self) -> IntArray:
         """(k,) rows of the observations' landmarks."""
         return _NONE if self.seen is None else self.seen.points
 
     @cached_property
     def _incidence(self) -> tuple[csr_matrix, csr_matrix]:
-        """(n, k) and (m, k): which observation is which pose's and which landmark's."""
-        every, k = np.arange(len(self._poses)), len(self._poses)
-        one = np.ones(k)
-        return (
-            csr_matrix((one, (self._poses, every)), (len(self.pose_keys), k)),
-            csr_matrix((one, (self._points, every)), (len(self.landmark_keys), k)),
-        )
-
-    def _coupled(self, blocks: FloatArray) -> bsr_matrix:
-        """Sparse (6n, 3m) of each observation's block (k, 6, 3)."""
-        n, m = len(self.pose_keys), len(self.landmark_keys)
-        order = np.lexsort((self._points, self._poses))
-        start = np.searchsorted(self._poses[order], np.arange(n + 1))
-        return bsr_matrix((blocks[order], self._points[order], start), (6 * n, 3 * m))
+        """Of the observations."""
+        if self.seen is None:
+            raise ValueError("no observations")
+        return self.seen.incidence(len(self.pose_keys), len(self.landmark_keys))
 
 
 class Descent:

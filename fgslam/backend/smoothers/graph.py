@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -26,20 +26,28 @@ from fgslam.backend.loops import (
     nearest_positive,
     refusal,
 )
+from fgslam.backend.measured import prior_of, sensor_in_pose
 from fgslam.backend.persistence import Persistence, StatedNoise
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
-from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
+from fgslam.backend.smoothers.bundle import Sightings, State, Turn, TurnedStep, WholeGraph
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.correction import FIELD_PX, RigCorrection
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log, transform_to_world
-from fgslam.core.sensors import CameraRig, Increment, LoopClosure, Observations, Odometry
+from fgslam.core.sensors import (
+    CameraRig,
+    Increment,
+    LoopClosure,
+    Measured,
+    Observations,
+    Odometry,
+)
 from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 from fgslam.factors.landmark import StereoFactors
-from fgslam.factors.measurement import whitening
+from fgslam.factors.measurement import gtsam_factor, whitening
 from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
 from fgslam.factors.noise import Whitening, scaled
 
@@ -98,6 +106,7 @@ class TrackedFrame:
         accepted: observations that fit.
         turn: what the bias of a gyroscope does to the motion.
         located: (6, 6) covariance with which it was found in the map without a prior; else None.
+        measured: by other sensors than the camera.
     """
 
     frame: int
@@ -106,6 +115,7 @@ class TrackedFrame:
     accepted: Observations
     turn: Turn | None = None
     located: FloatArray | None = None
+    measured: tuple[Measured, ...] = ()
 
 
 @dataclass(slots=True, eq=False)
@@ -119,6 +129,7 @@ class NewFactors:
         priors: landmark variables, mean (3,) and covariance (3, 3) of what is known of them
             beforehand; where no factors are made of it.
         sightings: landmark variables and what was seen of them.
+        measured: landmark variables by other sensors than the camera.
     """
 
     frame: int
@@ -126,6 +137,7 @@ class NewFactors:
     values: Any
     priors: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
     sightings: list[tuple[int, Sighting]] = field(default_factory=list)
+    measured: list[Sightings] = field(default_factory=list)
 
 
 class GraphBuilder:
@@ -135,6 +147,7 @@ class GraphBuilder:
         graph: all factors but observations; one taken out leaves an empty slot.
         observed: the observations: frame, variable, measurement, covariance, whether taken out.
         admission: the landmarks, and which of them the graph holds.
+        measured: landmarks by other sensors, by kind.
         frames: those whose poses are in the graph, in time order.
         noise: of its landmark observations.
     """
@@ -175,6 +188,8 @@ class GraphBuilder:
         self.graph = gtsam.NonlinearFactorGraph()
         self.admission = LandmarkAdmission(sensor, settings)
         self.frames: list[int] = []
+        self.measured: dict[str, Sightings] = {}
+        self._waiting: dict[int, list[tuple[int, Measured]]] = {}
 
     @property
     def kernel(self) -> KernelSettings:
@@ -229,9 +244,13 @@ class GraphBuilder:
         self._add_pose(new, tracked)
         self.frames.append(tracked.frame)
         self._add_observations(new, tracked, landmarks)
+        self._add_measured(new, tracked, landmarks)
         if self._remember:
             gone = np.zeros(len(new.sightings), np.bool_)
             self.observed.append(_columns(new.sightings) | {"gone": gone})
+            for one in new.measured:
+                kind, before = one.model.kind, self.measured.get(one.model.kind)
+                self.measured[kind] = one if before is None else before.join(one)
         return new
 
     def take_out(self, variable: int) -> str:
@@ -243,6 +262,8 @@ class GraphBuilder:
         for row in self._rows.pop(variable, []):
             self.graph.remove(row)
         self.observed["gone"][self.observed["variable"] == variable] = True
+        key = landmark_key(variable)
+        self.measured = {k: one.select(one.points != key) for k, one in self.measured.items()}
         words = self.describe(variable)
         self.admission.taken_out(self.identities[variable], variable)
         return words
@@ -267,6 +288,8 @@ class GraphBuilder:
         """(variables,) the first frame that saw each landmark variable; 0 where none is kept."""
         first = np.full(self.variables, np.iinfo(np.int64).max)
         np.minimum.at(first, self.observed["variable"], self.observed["frame"])
+        for one in self.measured.values():
+            np.minimum.at(first, one.points - landmark_key(0), one.poses - pose_key(0))
         return np.where(first < np.iinfo(np.int64).max, first, 0)
 
     def of_saved_map(self, variable: int) -> bool:
@@ -309,11 +332,16 @@ class GraphBuilder:
         """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
         out = self._other_factors()
         out.push_back(self._observation_factors(*self.kept_observed()))
+        for one in self.measured.values():
+            out.push_back(one.factors())
         return out
 
-    def observation_factors(self, sightings: list[tuple[int, Sighting]]) -> Any:
-        """Factors of observations of landmark variables, weighed as is known now."""
-        return self._observation_factors(*_columns(sightings).values())
+    def observation_factors(self, new: NewFactors) -> Any:
+        """Factors of a frame's observations of landmark variables, weighed as is known now."""
+        out = self._observation_factors(*_columns(new.sightings).values())
+        for one in new.measured:
+            out.push_back(one.factors())
+        return out
 
     def _observation_factors(
         self, frames: IntArray, variables: IntArray, measured: FloatArray, covariances: FloatArray
@@ -332,14 +360,9 @@ class GraphBuilder:
         """Without turns of a gyroscope."""
         others = self._other_factors(turned=False)
         frames, variables, measured, covariances = self.kept_observed()
-        return WholeGraph.of(
-            others,
-            values,
-            kernel,
-            (pose_key(0) + frames, landmark_key(0) + variables),
-            (measured, whitening(self._power * covariances)),
-            self._sensor,
-        )
+        keys = pose_key(0) + frames, landmark_key(0) + variables
+        seen = Sightings(*keys, measured, whitening(self._power * covariances), self._sensor)
+        return WholeGraph.of(others, values, kernel, seen, self.measured.values())
 
     def kept_observed(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
         """Frames (k,), variables (k,), measurements and covariances of what was not taken out."""
@@ -425,6 +448,50 @@ class GraphBuilder:
                 track.waiting.append(sighting)
                 if self.admission.admits(identity, parallaxes[i]):
                     self._enter(new, identity, positions[i], wTc, parallaxes[i])
+
+    def _add_measured(self, new: NewFactors, tracked: TrackedFrame, landmarks: LandmarkMap) -> None:
+        """What other sensors measured, of landmarks as soon as the tracker has a place for them."""
+        frame, key = new.frame, pose_key(new.frame)
+        ready: dict[str, list[tuple[int, int, Measured]]] = {}
+        for one in tracked.measured:
+            if one.of_pose:
+                xTs = sensor_in_pose(self._sensor, one.model)
+                for value, noise in zip(one.values, one.covariance, strict=True):
+                    model = gtsam.noiseModel.Gaussian.Covariance(noise)
+                    self._push(new, gtsam_factor(one.model, [key], value, model, xTs))
+                continue
+            first = [i not in self.admission.tracks and i not in self._waiting for i in one.ids]
+            for each in (*prior_of(one.select(np.array(first, np.bool_))), one):
+                for row, identity in enumerate(each.ids.tolist()):
+                    self._waiting.setdefault(identity, []).append(
+                        (frame, each.select(np.array([row])))
+                    )
+        for identity in np.intersect1d(list(self._waiting), landmarks.ids).tolist():
+            track = self.admission.tracks.get(identity)
+            if track is None or not track.by_camera:
+                track = self.admission.sighted(identity, Sighting.by_others(frame))
+                if track.variable < 0:
+                    row = landmarks.rows(np.array([identity]))[0]
+                    self._enter(new, identity, landmarks.positions[row], tracked.wTc, np.inf)
+            if track.variable >= 0:
+                for seen, one in self._waiting.pop(identity):
+                    if seen >= self.admission.first_frame:
+                        ready.setdefault(one.kind, []).append((seen, track.variable, one))
+        new.measured = [self._sightings(*zip(*known, strict=True)) for known in ready.values()]
+
+    def _sightings(
+        self, frames: Sequence[int], variables: Sequence[int], measured: Sequence[Measured]
+    ) -> Sightings:
+        """Of landmark variables from frames of the graph, by one model, one each."""
+        model = measured[0].model
+        return Sightings(
+            pose_key(0) + np.array(frames),
+            landmark_key(0) + np.array(variables),
+            np.concatenate([one.values for one in measured]),
+            whitening(np.concatenate([one.covariance for one in measured])),
+            model,
+            sensor_in_pose(self._sensor, model),
+        )
 
     def _enter(
         self,

@@ -59,7 +59,7 @@ class Isam2Solver(WholeGraphSolver):
     def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
-        self._graph.push_back(self.builder.observation_factors(new.sightings))
+        self._graph.push_back(self.builder.observation_factors(new))
         self.new_values.insert(new.values)
         self._answer = None
 

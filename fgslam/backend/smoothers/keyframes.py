@@ -174,7 +174,8 @@ class Segments:
         here = len(self._motions) - later
         since, self._motions = self._motions[:here], self._motions[here:]
         motion = compose_odometry(since) if since else None
-        return TrackedFrame(frame.frame, frame.wTc, motion, accepted, Turn.of(since))
+        turn, measured = Turn.of(since), frame.measured
+        return TrackedFrame(frame.frame, frame.wTc, motion, accepted, turn, measured=measured)
 
 
 def _corrected(frame: TrackedFrame, change: RigChange) -> TrackedFrame:

@@ -181,7 +181,9 @@ class FixedLagSolver:
         self.window.kernel = self.builder.kernel
         known = self.window.landmarks.variables
         before = int(known[-1]) if len(known) else -1
-        entered = sorted({v for v, _ in new.sightings if v > before})
+        seen = [v for v, _ in new.sightings]
+        seen += [v for one in new.measured for v in (one.points - landmark_key(0)).tolist()]
+        entered = sorted({v for v in seen if v > before})
         if entered:
             self.window.add_landmarks(_landmarks(new, entered))
         if new.sightings:
@@ -191,6 +193,9 @@ class FixedLagSolver:
                 np.array([s.measurement for _, s in new.sightings]),
                 self.builder.noise.power * np.array([s.covariance for _, s in new.sightings]),
             )
+
+        for one in new.measured:
+            self.window.measure(one)
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""

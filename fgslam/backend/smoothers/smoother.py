@@ -119,10 +119,14 @@ class Smoother:
         # The tracker's covariances are given the graph's, and so are not uncertain themselves.
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
         stats = self.tracker.update(plain, tracking)
+        if increment.measured:
+            now = self.tracker.predict(None)
+            tracking = dataclasses.replace(tracking, wTc=now.wTc, covariance=now.covariance)
         self._record(increment, tracking)
         learn_from(self.builder.noise, len(self.inputs) - 1, increment, tracking, before)
         tracked = self._admitted(increment, tracking)
-        entering = self._entering(tracked, at_once=bool(increment.loops))
+        at_once = bool(increment.loops or increment.measured)
+        entering = self._entering(tracked, at_once)
         for frame in entering:
             self._add(frame)
         if entering:
@@ -168,7 +172,9 @@ class Smoother:
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame, step = len(self.inputs) - 1, increment.odometry
-        return TrackedFrame(frame, tracking.wTc, step, self._held(accepted), Turn.of((step,)))
+        turn, measured = Turn.of((step,)), increment.measured
+        held = self._held(accepted)
+        return TrackedFrame(frame, tracking.wTc, step, held, turn, measured=measured)
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""

@@ -22,6 +22,7 @@ from fgslam.backend.loops import home_changes, rotated, transported
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.admission import LEAST_PARALLAX
+from fgslam.backend.smoothers.bundle import Sightings
 from fgslam.backend.smoothers.elimination import (
     Eliminated,
     Equations,
@@ -62,12 +63,19 @@ from fgslam.factors.noise import kernel_weights
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed(Rows):
-    """Observations of the window (k, ...): frame, landmark variable, numbers and whitening."""
+    """Observations of the window (k, ...): frame, landmark variable, numbers and whitening.
+
+    All by one sensor, at ``xTs`` (4, 4) in the frame of the poses; None: they are its own.
+    """
+
+    SHARED = frozenset({"model", "xTs"})
 
     frame: IntArray
     variable: IntArray
     measurement: FloatArray
     root: FloatArray
+    model: Any
+    xTs: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -343,6 +351,7 @@ class _Off(Rows):
 # ------------------------------------------------------------------------------------------
 # What has left a window of poses and landmarks, as a quadratic over what is still in it
 
+_OPEN = 1e-9  # of a measurement's information: what is left to directions that it leaves open
 _UNCOUPLED = 1e-9  # of a landmark's own information: a coupling that changes it by less is none
 
 
@@ -459,11 +468,13 @@ class WindowPrior:
         """
         turned = np.swapaxes(rows.by_point, 1, 2)
         p, coupling = len(self.variables), self.coupling.copy()
-        at = columns[:, None] + np.arange(6)
+        at, own = columns[:, None] + np.arange(6), turned @ rows.by_point
+        if rows.residual.shape[1] < 3:  # such a block has no inverse
+            own += _OPEN * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         coupling[landmark[:, None], :, at] += np.swapaxes(turned @ rows.by_pose, 1, 2)
         return dataclasses.replace(
             self,
-            own=self.own + summed(landmark, turned @ rows.by_point, p),
+            own=self.own + summed(landmark, own, p),
             gradient=self.gradient + summed(landmark, products(turned, rows.residual), p),
             coupling=coupling,
         )
@@ -565,7 +576,8 @@ class Window:
         frames: of the poses.
         poses: (n, 4, 4) ``wTc``.
         landmarks: seen from them.
-        observed: from these poses.
+        observed: by the camera from these poses.
+        measured: by other sensors, by kind.
         factors: GTSAM's graph on these poses alone.
         prior: what has left.
         places: where they began, (4, 4): of landmarks that came back, in the order of the prior's.
@@ -574,12 +586,13 @@ class Window:
 
     def __init__(self, sensor: CameraRig, kernel: KernelSettings) -> None:
         """Empty."""
-        self._sensor, self.kernel = sensor, kernel
+        self.kernel = kernel
         self.frames: list[int] = []
         self.poses = np.empty((0, 4, 4))
         none = np.empty(0, np.int64)
         self.landmarks = Landmarks(none, np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
-        self.observed = Observed(none, none, np.empty((0, 3)), np.empty((0, 3, 3)))
+        self.observed = Observed(none, none, np.empty((0, 3)), np.empty((0, 3, 3)), sensor)
+        self.measured: dict[str, Observed] = {}
         self.factors = gtsam.NonlinearFactorGraph()
         self.prior = WindowPrior.none()
         self.places: dict[int, FloatArray] = {}
@@ -606,8 +619,15 @@ class Window:
         self, frame: IntArray, variable: IntArray, measurement: FloatArray, noise: FloatArray
     ) -> None:
         """Observations (k,) of landmarks of the window from its frames; noise (k, 3, 3)."""
-        new = Observed(frame, variable, measurement, whitening(noise))
+        new = Observed(frame, variable, measurement, whitening(noise), self.observed.model)
         self.observed = self.observed.join(new)
+
+    def measure(self, seen: Sightings) -> None:
+        """What another sensor measured of landmarks of the window."""
+        frame, variable = seen.poses - pose_key(0), seen.points - landmark_key(0)
+        new = Observed(frame, variable, seen.measured, seen.roots, seen.model, seen.xTs)
+        kind = new.model.kind
+        self.measured[kind] = self.measured[kind].join(new) if kind in self.measured else new
 
     def remeasure(self, change: RigChange) -> None:
         """Corrects the observations of the frames that the change is of."""
@@ -688,9 +708,10 @@ class Window:
         """Some of the window's observations; a kernel weighs each where it is linearised."""
         (pose, point), o, kernel = self._rows(observed), observed, self.kernel
         at, places = self._where_linearised()
-        rows = linearise(self._sensor, at[pose], places[point], o.measurement, o.root)
+        rows = linearise(o.model, at[pose], places[point], o.measurement, o.root, o.xTs)
         squared = np.einsum("ki,ki->k", rows.residual, rows.residual)
-        weight = kernel_weights(kernel.name, kernel.width, squared)
+        name = kernel.name if o.model is self.observed.model else "none"  # stated noise is true
+        weight = kernel_weights(name, kernel.width, squared)
         residual = rows.residual + products(rows.by_point, (self.landmarks.points - places)[point])
         residual += products(rows.by_pose, self._shift[pose])
         return Look(pose, point, weighed(dataclasses.replace(rows, residual=residual), weight))
@@ -706,20 +727,21 @@ class Window:
 
     def equations(self) -> Equations:
         """Normal equations of all that the window holds, where it is linearised."""
-        look = self.linearise(self.observed)
-        pose, point, rows = look.pose, look.point, look.rows
         n, m, p = len(self.frames), len(self.landmarks.variables), self.prior
         tied, r, weak = self._tied(), p.hidden, self.landmarks
-        turned = np.swapaxes(rows.by_point, 1, 2)
-        coupling = np.zeros((m, 3, n, 6))
-        coupling[point, :, pose, :] = turned @ rows.by_pose
-        own = weak.information + summed(point, turned @ rows.by_point, m)
+        coupling, own = np.zeros((m, 3, n, 6)), weak.information.copy()
         gradient = products(weak.information, weak.points - weak.mean)
-        gradient += summed(point, products(turned, rows.residual), m)
+        looks = [self.linearise(observed) for observed in self._every]
+        for look in looks:  # a landmark once a frame by each
+            pose, point, rows = look.pose, look.point, look.rows
+            turned = np.swapaxes(rows.by_point, 1, 2)
+            coupling[point, :, pose, :] += turned @ rows.by_pose
+            own += summed(point, turned @ rows.by_point, m)
+            gradient += summed(point, products(turned, rows.residual), m)
         by = weak.points[tied] - p.points
         own[tied] += p.own
         gradient[tied] += p.gradient + products(p.own, by)
-        corner, right = self._corner_of(pose, rows, n, r)
+        corner, right = self._corner_of(looks, n, r)
         self._add_factors(corner, right, self.factors, self._shift)
         corner += p.corner
         right += p.corner_gradient + p.corner[:, r:] @ self._shift.ravel()
@@ -728,15 +750,20 @@ class Window:
             corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, p.coupling
         )
 
-    def _corner_of(
-        self, pose: IntArray, rows: LinearRows, n: int, r: int
-    ) -> tuple[FloatArray, FloatArray]:
+    @property
+    def _every(self) -> list[Observed]:
+        """The observations of all sensors."""
+        return [self.observed, *self.measured.values()]
+
+    def _corner_of(self, looks: list[Look], n: int, r: int) -> tuple[FloatArray, FloatArray]:
         """What observations say of poses alone: (r + 6n, r + 6n) and (r + 6n,)."""
-        turned = np.swapaxes(rows.by_pose, 1, 2)
         corner, right = np.zeros((r + 6 * n, r + 6 * n)), np.zeros(r + 6 * n)
         at = r + 6 * np.arange(n)[:, None] + np.arange(6)
-        corner[at[:, :, None], at[:, None, :]] = summed(pose, turned @ rows.by_pose, n)
-        right[at] = summed(pose, products(turned, rows.residual), n)
+        for look in looks:
+            pose, rows = look.pose, look.rows
+            turned = np.swapaxes(rows.by_pose, 1, 2)
+            corner[at[:, :, None], at[:, None, :]] += summed(pose, turned @ rows.by_pose, n)
+            right[at] += summed(pose, products(turned, rows.residual), n)
         return corner, right
 
     def _add_factors(
@@ -771,42 +798,51 @@ class Window:
         leaving = int(np.searchsorted(self.frames, first))
         if not leaving:
             return self.landmarks.select(np.empty(0, np.int64))
-        gone = self.observed.frame < first
         touched, untouched = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
         for row in range(self.factors.size()):
             factor = self.factors.at(row)
             earliest = min(number(key) for key in list(factor.keys()))
             (touched if earliest < first else untouched).add(factor)
-        self._into_prior(self.linearise(self.observed.select(gone)), touched, leaving)
+        gone = [self.linearise(one.select(one.frame < first)) for one in self._every]
+        self._into_prior(gone, touched, leaving)
         self.factors = untouched
-        self.observed = self.observed.select(~gone)
+        self._keep(lambda one: one.frame >= first)
         self._drop_poses(leaving)
-        return self._eliminate(~np.isin(self.landmarks.variables, self.observed.variable))
+        left = np.concatenate([one.variable for one in self._every])
+        return self._eliminate(~np.isin(self.landmarks.variables, left))
 
-    def _into_prior(self, look: Look, factors: Any, leaving: int) -> None:
+    def _keep(self, which: Callable[[Observed], BoolArray]) -> None:
+        """Those observations alone of which a mask says so."""
+        self.observed = self.observed.select(which(self.observed))
+        self.measured = {kind: one.select(which(one)) for kind, one in self.measured.items()}
+
+    def _into_prior(self, looks: list[Look], factors: Any, leaving: int) -> None:
         """Adds what the first poses measured to the prior, and hides them there."""
-        counts: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
-        pose, point = look.pose[counts], look.point[counts]
-        rows = look.rows.select(counts)
         variables, points = self.landmarks.variables, self.landmarks.points
-        new = np.setdiff1d(variables[point], self.prior.variables)
+        there = [self._where_derived(look) for look in looks]
+        seen = np.concatenate([variables[look.point] for look in there])
+        new = np.setdiff1d(seen, self.prior.variables)
         prior = self.prior.with_landmarks(new, points[np.searchsorted(variables, new)])
-        tied, n, r = (
-            np.searchsorted(prior.variables, variables[point]),
-            len(self.frames),
-            prior.hidden,
-        )
-        # Residuals as they would be where the derivatives were taken.
-        by = points[point] - prior.points[tied]
-        there = rows.residual - products(rows.by_point, by)
-        there -= products(rows.by_pose, self._shift[pose])
-        rows = dataclasses.replace(rows, residual=there)
-        corner, right = self._corner_of(pose, rows, n, r)
+        n, r = len(self.frames), prior.hidden
+        corner, right = self._corner_of(there, n, r)
         self._add_factors(corner, right, factors, np.zeros_like(self._shift))
-        self.prior = prior.with_leaving(leaving, corner, right).with_rows(tied, r + 6 * pose, rows)
+        prior = prior.with_leaving(leaving, corner, right)
+        for look in there:
+            tied = np.searchsorted(prior.variables, variables[look.point])
+            prior = prior.with_rows(tied, r + 6 * look.pose, look.rows)
+        self.prior = prior
         for key in factors.keyVector():
             row = self.frames.index(number(key))
             self._anchors.setdefault(number(key), self.poses[row])
+
+    def _where_derived(self, look: Look) -> Look:
+        """Those that count, with residuals as they would be where the derivatives were taken."""
+        counts: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
+        pose, point, rows = look.pose[counts], look.point[counts], look.rows.select(counts)
+        moved = (self.landmarks.points - self._where_linearised()[1])[point]
+        residual = rows.residual - products(rows.by_point, moved)
+        residual -= products(rows.by_pose, self._shift[pose])
+        return Look(pose, point, dataclasses.replace(rows, residual=residual))
 
     def _drop_poses(self, leaving: int) -> None:
         for frame in self.frames[:leaving]:
@@ -882,7 +918,7 @@ class Window:
 
     def take_out(self, variable: int) -> None:
         """Takes a landmark out, with what the window's poses saw of it."""
-        self.observed = self.observed.select(self.observed.variable != variable)
+        self._keep(lambda one: one.variable != variable)
         self._eliminate(self.landmarks.variables == variable)
 
     def carried_along(self, by: FloatArray, prior: Any, saved: IntArray = _NONE) -> None:

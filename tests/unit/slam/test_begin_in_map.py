@@ -7,9 +7,9 @@ import pytest
 
 from fgslam.backend.filters.ekf import (
     FRONT,
-    FloorMeasurement,
     GrowingCovariance,
     Matches,
+    PoseMeasurement,
     correct,
     rows_of,
 )
@@ -202,7 +202,7 @@ def test_schmidt_s_correction_is_joseph_s_form_with_the_landmarks_gain_zero(
     observed = seen(saved, 0.3 * rng.standard_normal((count, 3)), count).observations
     positions = saved.landmarks.positions[:count]
     matches = Matches.of(RIG, WTC, np.arange(count), positions, observed)
-    no_floor = FloorMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
+    no_floor = PoseMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
     full = correct(covariance, covariance.front(), matches, no_floor, 0.0)
     found = full.of_the_pose_alone()
     h = np.zeros((3 * count, n))

@@ -12,10 +12,10 @@ from simulated import RIG, Drive, Simulation, assert_same_bits, simulate, tracke
 
 from fgslam.backend.filters.ekf import (
     DivergedError,
-    FloorMeasurement,
     FullEkf,
     GrowingCovariance,
     Matches,
+    PoseMeasurement,
     correct,
 )
 from fgslam.backend.settings import EkfSettings
@@ -203,7 +203,7 @@ def test_a_correction_is_the_dense_kalman_filter(landmarks: int, rng: np.random.
     p = root @ root.T / n + np.eye(n)
     blocks = list(range(0, landmarks, 2))
     matches = random_matches(rng, blocks)
-    floor = FloorMeasurement(rng.standard_normal(2), rng.standard_normal((2, 6)), np.array([1, 2]))
+    floor = PoseMeasurement(rng.standard_normal(2), rng.standard_normal((2, 6)), np.array([1, 2]))
     covariance = grown(p)
     found = correct(covariance, covariance.front(), matches, floor, 0.0)
     h = np.zeros((3 * len(blocks) + 2, n))
@@ -412,7 +412,7 @@ def test_a_covariance_that_would_lose_its_definiteness_is_refused(
 ) -> None:
     p = np.eye(12)
     p[6:9, 6:9] = -np.eye(3)
-    nothing = FloorMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
+    nothing = PoseMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
     with pytest.raises(DivergedError, match="landmark's covariance is not positive"):
         correct(grown(p), grown(p).front(), random_matches(rng, [1]), nothing, 0.0)
 
@@ -458,7 +458,7 @@ def test_a_soft_floor_is_what_the_graphs_factors_say(dof: int, rng: np.random.Ge
         for factor in floor_factors(0, ground, wTc):
             a, b = factor.linearize(values).jacobian()
             information, vector = information + a.T @ a, vector + a.T @ b
-        found = FloorMeasurement.of(ground, wTc)
+        found = PoseMeasurement.of_floor(ground, wTc)
         weighted = found.jacobian.T / found.variance
         scale = np.abs(information).max()
         np.testing.assert_allclose(

@@ -80,7 +80,7 @@ def known(points: dict[int, list[float]], sigma: float = 0.02) -> LandmarkMap:
 
 def landmarks_of(made: GraphBuilder, new: NewFactors) -> list[tuple[int, ...]]:
     """Keys of a frame's factors that touch a landmark."""
-    graphs = new.graph, made.observation_factors(new.sightings)
+    graphs = new.graph, made.observation_factors(new)
     factors = [graph.at(row) for graph in graphs for row in range(graph.size())]
     return [tuple(f.keys()) for f in factors if not is_pose(f.keys()[-1])]
 
