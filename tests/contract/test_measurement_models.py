@@ -124,14 +124,14 @@ def smoothed(world: Beacons, kind: str = "batch") -> Smoother:
     "kinds", [("range_bearing",), ("guessed_direction", "position"), ("range",)]
 )
 def test_batch_ends_at_the_optimum_of_gtsam(kinds: tuple[str, ...]) -> None:
-    estimator = smoothed(drive(kinds))
+    estimator = smoothed(drive(kinds, frames=16, beacons=5))
     graph, values = estimator.builder.kept_factors(), estimator.solver.values
     optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, solver_parameters(100, 1e-12))
     theirs = optimum.optimize()
     found = estimator.estimate().trajectory.poses
     expected = np.array([theirs.atPose3(pose_key(k)).matrix() for k in range(len(found))])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
-    assert graph.error(theirs) > 10.0
+    assert graph.error(theirs) > 1.0
 
 
 def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:
