@@ -124,7 +124,7 @@ def smoothed(world: Beacons, kind: str = "batch") -> Smoother:
     "kinds", [("range_bearing",), ("guessed_direction", "position"), ("range",)]
 )
 def test_batch_ends_at_the_optimum_of_gtsam(kinds: tuple[str, ...]) -> None:
-    estimator = smoothed(drive(kinds, frames=16, beacons=5))
+    estimator = smoothed(drive(kinds, frames=24, beacons=4))
     graph, values = estimator.builder.kept_factors(), estimator.solver.values
     optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, solver_parameters(100, 1e-12))
     theirs = optimum.optimize()
