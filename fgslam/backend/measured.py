@@ -38,7 +38,7 @@ _RIVAL = float(chi_square_quantile(0.999, 3))
 
 
 class RelativePoint(LandmarkModel):
-    """Where a landmark is in the sensor's frame: what a weak prior says."""
+    """Where a landmark is in the sensor's frame: what a weak prior states."""
 
     kind, size = "relative_point", 3
 

@@ -41,6 +41,11 @@ class MeasurementModel:
         """``bTs`` left out: the sensor's frame is the body's."""
         self.bTs = np.eye(4) if bTs is None else np.asarray(bTs, np.float64)
 
+    @property
+    def has_factor(self) -> bool:
+        """Whether :meth:`factor` gives one."""
+        return type(self).factor is not MeasurementModel.factor
+
     def measured(
         self, values: npt.ArrayLike, covariance: npt.ArrayLike, ids: npt.ArrayLike = ()
     ) -> Measured:

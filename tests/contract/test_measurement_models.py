@@ -13,7 +13,7 @@ from test_estimators import SETTINGS
 
 import fgslam as fg
 from fgslam.backend.measured import RelativePoint
-from fgslam.backend.settings import BatchSettings
+from fgslam.backend.settings import BatchSettings, Isam2Settings
 from fgslam.backend.smoothers.bundle import PLAIN, Sightings, WholeGraph
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
@@ -25,7 +25,7 @@ from fgslam.core.store import restore, state_of
 from fgslam.core.types import Prediction
 from fgslam.factors.graphs import landmark_key, pose_key, solver_parameters
 from fgslam.factors.measurement import MeasurementModel, PoseModel, gtsam_factor, linearise
-from fgslam.factors.models import Position
+from fgslam.factors.models import Position, Range
 from fgslam.slam.build import make_estimator
 
 ESTIMATORS = ("landmark_kalman", "ekf", "fixed_lag", "sliding_window", "isam2", "batch")
@@ -132,6 +132,18 @@ def test_batch_ends_at_the_optimum_of_gtsam(kinds: tuple[str, ...]) -> None:
     expected = np.array([theirs.atPose3(pose_key(k)).matrix() for k in range(len(found))])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
     assert graph.error(theirs) > 1.0
+
+
+def test_isam2_takes_linear_factors_for_those_that_call_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ranges with GTSAM's factor, and without: the same tree, up to where it is relinearised."""
+    world, online = drive(("range_bearing", "range"), frames=24, beacons=4), []
+    for factor in (Range.factor, MeasurementModel.factor):
+        monkeypatch.setattr(Range, "factor", factor)
+        online.append(fg.replay(world.log, Isam2Settings(update_every=1)).online.poses)
+    assert not np.array_equal(*online)
+    np.testing.assert_allclose(*online, rtol=0, atol=2e-3)
 
 
 def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:

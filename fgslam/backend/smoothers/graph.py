@@ -328,19 +328,24 @@ class GraphBuilder:
         places = np.einsum("kij,kj->ki", wTc[:, :3, :3], local) + wTc[:, :3, 3]
         return {track.variable: place for track, place in zip(tracks, places, strict=True)}
 
-    def kept_factors(self) -> Any:
-        """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
+    def kept_factors(self, callbacks: bool = True) -> Any:
+        """All factors as one graph of GTSAM's, weighed as is known now, observations last.
+
+        ``callbacks``: those of models without a C++ factor, too.
+        """
         out = self._other_factors()
         out.push_back(self._observation_factors(*self.kept_observed()))
         for one in self.measured.values():
-            out.push_back(one.factors())
+            if callbacks or one.model.has_factor:
+                out.push_back(one.factors())
         return out
 
     def observation_factors(self, new: NewFactors) -> Any:
-        """Factors of a frame's observations of landmark variables, weighed as is known now."""
+        """C++ factors of a frame's observations of landmarks, weighed as is known now."""
         out = self._observation_factors(*_columns(new.sightings).values())
         for one in new.measured:
-            out.push_back(one.factors())
+            if one.model.has_factor:
+                out.push_back(one.factors())
         return out
 
     def _observation_factors(

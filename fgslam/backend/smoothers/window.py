@@ -731,8 +731,8 @@ class Window:
         tied, r, weak = self._tied(), p.hidden, self.landmarks
         coupling, own = np.zeros((m, 3, n, 6)), weak.information.copy()
         gradient = products(weak.information, weak.points - weak.mean)
-        looks = [self.linearise(observed) for observed in self._every]
-        for look in looks:  # a landmark once a frame by each
+        evaluated = [self.linearise(observed) for observed in self._every]
+        for look in evaluated:  # a landmark once a frame by each
             pose, point, rows = look.pose, look.point, look.rows
             turned = np.swapaxes(rows.by_point, 1, 2)
             coupling[point, :, pose, :] += turned @ rows.by_pose
@@ -741,7 +741,7 @@ class Window:
         by = weak.points[tied] - p.points
         own[tied] += p.own
         gradient[tied] += p.gradient + products(p.own, by)
-        corner, right = self._corner_of(looks, n, r)
+        corner, right = self._corner_of(evaluated, n, r)
         self._add_factors(corner, right, self.factors, self._shift)
         corner += p.corner
         right += p.corner_gradient + p.corner[:, r:] @ self._shift.ravel()
@@ -755,11 +755,11 @@ class Window:
         """The observations of all sensors."""
         return [self.observed, *self.measured.values()]
 
-    def _corner_of(self, looks: list[Look], n: int, r: int) -> tuple[FloatArray, FloatArray]:
+    def _corner_of(self, evaluated: list[Look], n: int, r: int) -> tuple[FloatArray, FloatArray]:
         """What observations say of poses alone: (r + 6n, r + 6n) and (r + 6n,)."""
         corner, right = np.zeros((r + 6 * n, r + 6 * n)), np.zeros(r + 6 * n)
         at = r + 6 * np.arange(n)[:, None] + np.arange(6)
-        for look in looks:
+        for look in evaluated:
             pose, rows = look.pose, look.rows
             turned = np.swapaxes(rows.by_pose, 1, 2)
             corner[at[:, :, None], at[:, None, :]] += summed(pose, turned @ rows.by_pose, n)
@@ -812,14 +812,14 @@ class Window:
         return self._eliminate(~np.isin(self.landmarks.variables, left))
 
     def _keep(self, which: Callable[[Observed], BoolArray]) -> None:
-        """Those observations alone of which a mask says so."""
+        """Those observations alone that a mask chooses."""
         self.observed = self.observed.select(which(self.observed))
         self.measured = {kind: one.select(which(one)) for kind, one in self.measured.items()}
 
-    def _into_prior(self, looks: list[Look], factors: Any, leaving: int) -> None:
+    def _into_prior(self, evaluated: list[Look], factors: Any, leaving: int) -> None:
         """Adds what the first poses measured to the prior, and hides them there."""
         variables, points = self.landmarks.variables, self.landmarks.points
-        there = [self._where_derived(look) for look in looks]
+        there = [self._where_derived(look) for look in evaluated]
         seen = np.concatenate([variables[look.point] for look in there])
         new = np.setdiff1d(seen, self.prior.variables)
         prior = self.prior.with_landmarks(new, points[np.searchsorted(variables, new)])
