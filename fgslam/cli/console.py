@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -18,7 +19,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.runs.folder import METRICS_FILE, REPORT_FILE
+from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
     from fgslam.cli.signals import Tell
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _NOTES_SHOWN = 8
 _LABEL_WIDTH = 12
 _WIDTH_OF_FILES = 120
+_BORDER = 3  # of a column: a line and a space at each side
 
 
 class Display:
@@ -98,9 +100,14 @@ def show_parts(
     for line in lines:
         console.out(line)
     for table in tables:
-        console.print(rich_table(table))
+        for part in fitting_tables(table, console.width):
+            console.print(part)
     for label, text in labelled:
-        console.out(f"{label:<{_LABEL_WIDTH}}{text}")
+        # Sentences are broken between words; paths stay whole.
+        room = console.width if label == "note" and console.is_terminal else 0
+        lines = wrap(text, room - _LABEL_WIDTH, break_long_words=False) if room else [text]
+        for k, line in enumerate(lines):
+            console.out(f"{'' if k else label:<{_LABEL_WIDTH}}{line}")
 
 
 def _files(result: RunResult) -> Iterator[tuple[str, str]]:
@@ -110,6 +117,10 @@ def _files(result: RunResult) -> Iterator[tuple[str, str]]:
         yield "metrics", str(result.folder / METRICS_FILE)
     if (result.folder / REPORT_FILE).is_file():
         yield "report", f"{result.folder / REPORT_FILE}  (open it in a browser)"
+    if result.status == "finished" and (result.folder / LOG_FILE).is_file():
+        yield "next", f"fgslam compare {result.folder} --estimators landmark_kalman,isam2,batch"
+        yield "", f"fgslam export {result.folder} --map map.ply --colour"
+        yield "", f"fgslam film {result.folder} run.mp4"
 
 
 def _console() -> Console:
@@ -118,13 +129,32 @@ def _console() -> Console:
     return console if console.is_terminal else Console(width=_WIDTH_OF_FILES)
 
 
-def rich_table(found: TextTable) -> Table:
-    """A table for the terminal."""
+def fitting_tables(found: TextTable, width: int) -> Iterator[Table]:
+    """A table for a terminal: in parts below each other where words would be cut."""
+    columns = [(c.name, *(v[k] for _, v in found.rows)) for k, c in enumerate(found.columns)]
+    longest = [max(map(len, " ".join(texts).split()), default=0) for texts in columns]
+    names = max(len(found.first), *(len(name) for name, _ in found.rows), 0)
+    room = width - names - _BORDER - 1
+    part: list[int] = []
+    for k in range(len(columns)):
+        if part and sum(longest[i] + _BORDER for i in (*part, k)) > room:
+            yield _rich_table(found, part, longest)
+            part = []
+        part.append(k)
+    whole = [max(map(len, texts)) + _BORDER for texts in columns]
+    yield _rich_table(found, part, None if sum(whole) <= room else longest)
+
+
+def _rich_table(found: TextTable, part: Sequence[int], widths: Sequence[int] | None) -> Table:
+    """Some columns, of their own widths or of those given."""
     headed = bool(found.first) or any(column.name for column in found.columns)
-    table = Table(title=found.heading, title_justify="left", show_header=headed)
+    heading = found.heading if not part or part[0] == 0 else None
+    table = Table(title=heading, title_justify="left", show_header=headed)
     table.add_column(found.first, no_wrap=True)
-    for column in found.columns:
-        table.add_column(column.name, justify="right" if headed else "left")
+    for k in part:
+        least = widths[k] if headed and widths is not None else None
+        name, side = found.columns[k].name, "right" if headed else "left"
+        table.add_column(name, justify=side, width=least)  # type: ignore[arg-type]
     for name, values in found.rows:
-        table.add_row(name, *values)
+        table.add_row(name, *(values[k] for k in part))
     return table
