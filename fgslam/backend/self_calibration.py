@@ -507,7 +507,7 @@ class WeighedCorrection:
 
 _KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motion's
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
-_LANDMARKS = 200  # of a window: all that a street shows, 500, make it surer by a fifth
+_LANDMARKS = 300  # of a window: all that a street shows, 500, make it surer by a tenth
 _CELLS = np.array([8, 6])  # of the image, across and down, over which they are spread
 _DAMPING = 1e-6
 _NEAREST_M = 1e-2
