@@ -53,7 +53,6 @@ LIMITS = {
 }
 _RIGHT_M = 0.2
 _APART_M = 12.0
-_REACH = np.arange(-4, 5)  # rooms to each side of the first one
 _CELLS, _BINS = 16, 8
 _FAR_AWAY = Prediction(pose(np.eye(3), np.array([0.0, 0.0, 1e4])), 1e-4 * np.eye(6))
 
@@ -146,7 +145,9 @@ def building(driven: Driven, size: int) -> tuple[LandmarkMap, LandmarkAppearance
     one, looks = driven.landmarks, driven.looks
     copies = -(-size // len(one))
     step = int(one.ids[-1]) + 1
-    places = np.array([(x, 0, z) for x in _REACH for z in _REACH])
+    side = int(np.ceil(np.sqrt(copies)))
+    reach = np.arange(side) - side // 2
+    places = np.array([(x, 0, z) for x in reach for z in reach])
     places = _APART_M * places[np.argsort((places**2).sum(axis=1), kind="stable")]
     ids, positions, views = [], [], []
     for k in range(copies):

@@ -21,8 +21,9 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import images, parts, ring, soak, sweeps
+from benchmarks.speed import homing, images, maps, parts, relocalising, ring, soak, starting, sweeps
 from benchmarks.tables import Table
+from fgslam.core.types import LandmarkAppearances, LandmarkMap
 
 
 @pytest.mark.parametrize(
@@ -223,6 +224,37 @@ def test_too_few_frames_over_images_are_refused_in_one_line(
     asked = ["speed", "--part", "images", "--frames", str(images.LEAST - 1)]
     assert runner.main(asked) == 2
     assert f"give {images.LEAST} or more" in capsys.readouterr().err
+
+
+def test_a_building_holds_copies_of_a_map_of_any_size() -> None:
+    one = LandmarkMap(np.arange(5), np.ones((5, 3)), np.zeros((5, 3, 3)))
+    zeros = np.zeros(5)
+    looks = LandmarkAppearances(
+        one.ids, np.zeros((5, 128), np.uint8), zeros, zeros, np.zeros((5, 3))
+    )
+    driven = relocalising.Driven(one, looks, [], np.empty((0, 4, 4)), [])
+    whole, every = relocalising.building(driven, 998)
+    assert len(whole) == len(every) == 998
+    rooms = np.unique(whole.positions, axis=0)
+    assert len(rooms) == 200
+    assert np.linalg.norm(rooms[:, None] - rooms, axis=2)[~np.eye(200, dtype=bool)].min() > 11.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", parts.PARTS)
+def test_every_part_of_speed_ends_with_numbers(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the smallest size that it has."""
+    for module, small in (
+        (maps, {"SIZES": (1_000, 100_000), "FRAMES": 3}),
+        (relocalising, {"SIZES": (1_000, 10_000), "FRAMES": 16, "ROUNDS": 1}),
+        (homing, {"SEEDS": (0,), "IMAGES": 6, "REPEATS": 1}),
+        (starting, {"_REPEATS": 1}),
+    ):
+        for name, value in small.items():
+            monkeypatch.setattr(module, name, value)
+    found = parts.measure(part, images.LEAST)
+    assert found
+    assert all(np.isfinite(value) for value in found.values())
 
 
 @pytest.mark.slow
