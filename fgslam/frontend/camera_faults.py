@@ -500,21 +500,54 @@ class CameraWatch:
         """Of the last frame, if it is refused: the first camera whose image is usable."""
 
     def look(
-        self, images: tuple[Image, ...], number: int | None = None, moved: bool = False
+        self,
+        images: tuple[Image, ...],
+        number: int | None = None,
+        moved: bool = False,
+        tracked: tuple[FloatArray, FloatArray] = (np.empty((0, 2)), np.empty((0, 3, 2))),
     ) -> str:
         """Takes in a frame; what is wrong with its images, in words; empty where nothing is.
 
-        ``number``: of the frame, as remarks give it; None counts the frames taken in. ``moved``:
-        odometry has measured motion since the last frame.
+        Args:
+            images: right, left[, top].
+            number: of the frame, as remarks give it; None counts the frames taken in.
+            moved: odometry has measured motion since the last frame.
+            tracked: landmarks in the last frame's reference image (n, 2), and in all of this one
+                (n, 3, 2), pixels. Where these show all images to be of one moment, no others
+                are looked for.
         """
-        now = Shrunk(images, self._factor)
-        repeated = self._repeated(images, moved)
+        now, repeated = Shrunk(images, self._factor), self._repeated(images, moved)
+        seen = self._by_landmarks(now, *tracked) if not repeated else []
+        fault = "" if seen else self._by_corners(now, repeated, seen)
+        if not fault:
+            self._turns.take(self._frames if number is None else number, seen)
+        self._before, self._frames = now.images, self._frames + 1
+        return fault
+
+    def _by_landmarks(self, now: Shrunk, before: FloatArray, pixels: FloatArray) -> list[LineRows]:
+        """Points of each other camera where they tell that it is of this moment; else none."""
+        if any(self._late) or any(pair.swapped for pair in self._pairs):
+            return []
+        seen, here = [], pixels[:, 0]
+        for camera, pair in enumerate(self._pairs, 1):
+            along, there = pair.model.across, pixels[:, camera]
+            rows = LineRows((there - here)[:, along], (before - here)[:, along], there)
+            if not pair.model.lag(rows, self._spread).together:
+                return []
+            seen.append(rows)
+        for camera, (pair, rows) in enumerate(zip(self._pairs, seen, strict=True), 1):
+            pair.rows = ([*pair.rows[0], rows][-_WINDOW:], [])
+            shown = here / self._factor, rows.place / self._factor
+            self._weigh(pair, now.grey[0], now.grey[camera], *shown)
+        return seen
+
+    def _by_corners(self, now: Shrunk, repeated: str, seen: list[LineRows]) -> str:
+        """As :meth:`look`, by corners that are followed across and in time; adds to ``seen``."""
         swapped = ""
         points = now.corners()
         across = [followed(now.images[0], other, points) for other in now.images[1:]]
         shown = np.logical_or.reduce([kept for _, kept in across])
         flow: Followed | None = None
-        seen: list[LineRows] = []
         for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
             if not repeated:  # else they are of two moments
@@ -535,9 +568,6 @@ class CameraWatch:
         fault = repeated or swapped or self._old()
         good = np.flatnonzero(~(np.array(self._late) | (self._same & bool(repeated))))
         self.alone = int(good[0]) if fault and not swapped and len(good) else None
-        if not fault:
-            self._turns.take(self._frames if number is None else number, seen)
-        self._before, self._frames = now.images, self._frames + 1
         return fault
 
     @property
@@ -565,7 +595,7 @@ class CameraWatch:
         self._sums = [zlib.crc32(image.tobytes()) for image in images]
         same = [a == b for a, b in zip(before, self._sums, strict=True)]
         self._same = np.array(same)
-        black = np.array([np.percentile(image[::4, ::4], 99) < _DARKEST for image in images])
+        black = np.array([(image[::4, ::4] >= _DARKEST).mean() <= 0.01 for image in images])
         if black.any() and not black.all():
             self._same = black
             return f"the {_names(black.tolist())} camera's image is black"

@@ -28,7 +28,7 @@ from fgslam.core.types import (
 from fgslam.frontend.camera_faults import CameraWatch
 from fgslam.frontend.stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import MatchNoise, unmeasured
-from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
+from fgslam.frontend.tracking.key_frames import Carried, CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
@@ -102,12 +102,15 @@ class SlamPipeline:
             body: the robot's motion since the last frame; None where none was measured.
         """
         self.watch_of_frame = Stopwatch()
-        before = self._before(frame)
-        frame = self._check_cameras(frame, index, body)  # late, frozen, swapped images are not used
+        before = self._before()
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
         around = self.witnesses.widened(prediction)
         carried = self._track_patches(around, frame, landmarks)  # between key frames
+        frame = self._check_cameras(frame, index, body, carried)  # late, frozen, swapped: not used
+        if frame.refused and self.key_frames is not None:
+            put_back(*before[-1])
+            carried = None
         if self.key_frames and carried and self._needs_no_features(carried, odometry, prediction):
             stereo, features = carried.carried.features, None
             matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
@@ -133,22 +136,26 @@ class SlamPipeline:
 
     # -- the steps, in their order -------------------------------------------------------------
 
-    def _before(self, frame: FeatureFrame) -> Snapshot:
-        """What a frame that comes without features changes before these are found."""
+    def _before(self) -> Snapshot:
+        """What a frame changes before its features are found."""
         self.rewound = False
-        if self.describe is None or frame.frame is None or frame.features:
-            return []
         parts = self.watch, self.motion, self.key_frames
         return [(part, snapshot(part)) for part in parts if has_state(part)]
 
     @timed("watch")
     def _check_cameras(
-        self, frame: FeatureFrame, index: int, body: Odometry | None = None
+        self,
+        frame: FeatureFrame,
+        index: int,
+        body: Odometry | None = None,
+        carried: CarriedFrame | None = None,
     ) -> FeatureFrame:
         """The frame; of images not of one moment and this one, that of one camera, or none."""
         if self.watch is None or frame.frame is None or frame.frame.alone is not None:
             return frame
-        fault = self.watch.look(frame.frame.images, index, has_moved(body))
+        seen = carried.carried if carried else Carried.nothing()
+        tracked = seen.before, seen.features.pixels
+        fault = self.watch.look(frame.frame.images, index, has_moved(body), tracked)
         if not fault:
             return frame
         alone = self.watch.alone

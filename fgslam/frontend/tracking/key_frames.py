@@ -357,9 +357,10 @@ class LandmarkCarrier:
         )
         good[good] = consistent
         features = features.noisier(crowding(places[good], PATCH_PX))
+        before = self._points.places[good]
         self._points = Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)
-        return Carried(self._points.ids, rows[good], features)
+        return Carried(self._points.ids, rows[good], before, features)
 
     def _keep(self, keep: BoolArray) -> None:
         self._points = self._points.select(keep)
@@ -437,18 +438,20 @@ class Carried(Rows):
     Attributes:
         ids: (k,) ascending.
         rows: (k,) which of the expected landmarks they are, ascending.
+        before: (k, 2) where the last reference image showed them.
         features: as measured in all images, with the appearance that was expected of them.
     """
 
     ids: IntArray
     rows: IntArray
+    before: FloatArray
     features: StereoFeatures
 
     @staticmethod
     def nothing() -> Carried:
         """No landmark."""
         none = np.empty(0, np.int64)
-        return Carried(none, none, StereoFeatures.empty())
+        return Carried(none, none, np.empty((0, 2)), StereoFeatures.empty())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

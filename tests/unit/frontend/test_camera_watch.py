@@ -457,6 +457,31 @@ def show(watch: TurnWatch, frame: int, rng: np.random.Generator, roll_deg: float
     watch.take(frame, [seen(rng, np.array([0.0, 0.0, roll_deg]))])
 
 
+def by_landmarks(lag: float) -> tuple[str, CameraWatch]:
+    """Blank images, whose landmarks show a left camera that is rolled from the fourth window on."""
+    rng, watch, reported = np.random.default_rng(5), CameraWatch(PAIR), ""
+    for frame in range(8 * WINDOW):
+        images = [np.full((240, 320), 100 + frame + k, np.uint8) for k in (0, 1)]
+        roll = 0.3 * (frame >= 4 * WINDOW)
+        rows = seen(rng, np.array([0.0, 0.0, roll]), 3.0, lag)
+        right = rows.place - np.stack([np.full(60, 9.0), rows.offset], axis=1)
+        before = right + np.stack([np.zeros(60), rows.shift], axis=1)
+        pixels = np.stack([right, rows.place, np.full((60, 2), np.nan)], axis=1)
+        reported += watch.look((images[0], images[1]), frame, False, (before, pixels))
+    return reported, watch
+
+
+def test_tracked_landmarks_show_a_knock_where_images_have_no_corner() -> None:
+    reported, watch = by_landmarks(0.0)
+    assert not reported
+    assert watch.knocked
+
+
+def test_landmarks_that_show_images_of_two_moments_are_not_relied_on() -> None:
+    _, watch = by_landmarks(1.0)
+    assert not watch.knocked
+
+
 def disturbed(first: int, length: int, turns_deg: FloatArray, axis: int) -> TurnWatch:
     """A watch after a drive in which a camera is turned for ``length`` frames."""
     rng, watch = np.random.default_rng(length), TurnWatch(PAIR, 0.1)

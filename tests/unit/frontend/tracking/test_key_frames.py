@@ -365,6 +365,7 @@ def test_many_that_contradict_the_pose_ask_for_a_key_frame(outliers: int, lastin
     carried = Carried(
         np.arange(100),
         np.arange(100),
+        np.zeros((100, 2)),
         features_at([(float(k), 50.0) for k in range(100)], [1.0] * 100),
     )
     used = np.arange(100) >= outliers
