@@ -502,11 +502,6 @@ class Witnesses:
                 out.append((1.0 / (1.0 + math.exp(-score)), iTo))
         return out
 
-    @property
-    def undecided(self) -> int:
-        """Frames for which neither witness is known to be right so far."""
-        return sum(self._decided(one) == "undecided" for one in self.found)
-
     def _decided(self, one: Contradiction) -> Verdict:
         score = self.score[one.episode]
         if one.verdict != "undecided" or abs(score) <= _DECIDED:

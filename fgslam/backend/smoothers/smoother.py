@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fgslam.backend.considered import ConsiderCovariance
+from fgslam.backend.considered import ConsiderCovariance, symmetric_root
 from fgslam.backend.filters.filtered import placed, require_finite
 from fgslam.backend.filters.kalman import LandmarkKalman, motions_by_lag
 from fgslam.backend.loops import CLOSURE_FACTOR, FREE, Constraint, starts_new_part
@@ -269,11 +269,10 @@ class Smoother:
         for row, lag in enumerate(LAGS):
             if lag in self._earlier and lag <= len(self._online):
                 before, joint = self._online[-lag], self._earlier[lag]
-                corrected = _positive(before.covariance - joint[:6, :6])
                 motion = inverse(before.wTc) @ current.wTc
-                found = motion_covariance(
-                    motion, joint[:6, :6] + corrected, joint[6:, 6:], joint[:6, 6:]
-                )
+                less = symmetric_root(before.covariance - joint[:6, :6])  # 0 where it was surer
+                then = joint[:6, :6] + less @ less
+                found = motion_covariance(motion, then, joint[6:, 6:], joint[:6, 6:])
                 out[row] = self._floor.allowed_part(current.wTc, found)
             out[row] += of_rig.get(lag, 0.0)
         self._online = [*self._online, current][-max(LAGS) :]
@@ -394,12 +393,6 @@ class Smoother:
             raise EstimatorError("only a new estimator can be restored")
         for increment, tracking in unpack(state, list[Input]):
             self.update(increment, tracking)
-
-
-def _positive(difference: FloatArray) -> FloatArray:
-    """The part (6, 6) of a difference of covariances that is one."""
-    variances, directions = np.linalg.eigh(0.5 * (difference + difference.T))
-    return np.asarray((directions * np.maximum(variances, 0.0)) @ directions.T)
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
