@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from fgslam.homing.topological_map import RouteMap
     from fgslam.report.figures import plot
     from fgslam.runs.judge import judge
-    from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
+    from fgslam.runs.library import graph, open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.session import Map, Result, Slam
     from fgslam.slam.feature_stream import FeatureExtractor
     from fgslam.slam.motion import MotionModel
@@ -77,6 +77,7 @@ __all__ = [
     "__version__",
     "compare",
     "errors",
+    "graph",
     "judge",
     "load_camera",
     "load_rig",
@@ -116,6 +117,7 @@ _HOMES = {
     "Trajectory": "fgslam.core.types",
     "TwoViewVector": "fgslam.core.bearings",
     "compare": "fgslam.evaluation.judging",
+    "graph": "fgslam.runs.library",
     "judge": "fgslam.runs.judge",
     "load_camera": "fgslam.cameras.omni_files",
     "load_rig": "fgslam.cameras.rig",

@@ -24,7 +24,14 @@ TUTORIALS = {
     "homing": ("Homing: one vector, then a drive home", ("homing_vector", "drive_home")),
     "own_parts": (
         "Your own parts",
-        ("own_estimator", "own_measurement", "own_features", "own_motion", "own_camera"),
+        (
+            "own_estimator",
+            "own_measurement",
+            "own_factors",
+            "own_features",
+            "own_motion",
+            "own_camera",
+        ),
     ),
     "live_robot": ("A live robot, with and without ROS 2", ("live_robot", "ros2_node")),
 }

@@ -9,8 +9,16 @@ from typing import Any, TypeAlias, cast, get_args
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.graph import FactorGraph
+from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import ConfigError, DatasetError, FrameError, MeasurementLogError
+from fgslam.core.errors import (
+    ConfigError,
+    DatasetError,
+    EstimatorError,
+    FrameError,
+    MeasurementLogError,
+)
 from fgslam.core.files import as_path
 from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.sensors import CameraRig, Odometry
@@ -28,7 +36,7 @@ from fgslam.runs.session import Overrides, override_texts, slam_config
 from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
 from fgslam.runs.units import Progress
 from fgslam.runs.workers import Pool
-from fgslam.slam.build import chosen_estimator, is_settings
+from fgslam.slam.build import chosen_estimator, is_settings, make_estimator
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 
@@ -286,3 +294,37 @@ def replay(
             f"estimator: this {type(chosen).__name__} has taken in frames already; give a new one"
         )
     return replay_log(log, chosen, ego_motion or EgoMotionSettings())
+
+
+def graph(
+    log: MeasurementLog,
+    estimator: str | EstimatorSettings = "batch",
+    ego_motion: EgoMotionSettings | None = None,
+) -> FactorGraph:
+    """A log as a factor graph of GTSAM's at an estimator's solution, to add factors of your own.
+
+    A key is ``gtsam.symbol("x", frame)``, or ``"l"`` with the number of a landmark variable.
+
+    Args:
+        log: the measurements; not changed.
+        estimator: `batch`, `isam2` or `sliding_window`, or settings of them.
+        ego_motion: as of :func:`replay`.
+
+    Returns:
+        gtsam.NonlinearFactorGraph, gtsam.Values, and the keys of poses and landmarks.
+
+    Raises:
+        ConfigError: no such estimator, or one that keeps no whole graph.
+        EstimatorError: it fails on this log.
+        MeasurementLogError: as of :func:`replay`.
+    """
+    chosen = chosen_estimator(estimator)
+    made = make_estimator(log.rig, chosen, ego_motion) if is_settings(chosen) else chosen
+    if not isinstance(made, MapSmoother):
+        raise ConfigError(
+            f"estimator: {made.kind} keeps no whole graph; use batch, isam2 or sliding_window"
+        )
+    failure = replay(log, made, ego_motion).failure
+    if failure:
+        raise EstimatorError(f"{made.kind}: {failure}")
+    return made.graph()

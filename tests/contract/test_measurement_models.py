@@ -17,7 +17,7 @@ from fgslam.backend.settings import BatchSettings, Isam2Settings
 from fgslam.backend.smoothers.bundle import PLAIN, Sightings, WholeGraph
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import MeasurementLogError
+from fgslam.core.errors import ConfigError, MeasurementLogError
 from fgslam.core.geometry import pose, se3_exp
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig, Increment, Odometry
@@ -231,6 +231,19 @@ def test_measurements_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(MeasurementLogError, match=words):
         Direction().measured(values, covariance, ids)
+
+
+def test_graph_of_a_log_is_at_the_optimum_and_takes_factors() -> None:
+    world = drive(("range_bearing", "position"), frames=12, beacons=4)
+    graph, values, poses, landmarks = fg.graph(world.log)
+    assert list(poses) == list(range(12))
+    assert sorted(landmarks) == list(range(4))
+    better = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    assert graph.error(better) == pytest.approx(graph.error(values), rel=1e-6)
+    expected = fg.replay(world.log, "batch").estimate.trajectory.poses[-1]
+    np.testing.assert_allclose(values.atPose3(poses[11]).matrix(), expected, rtol=0, atol=1e-9)
+    with pytest.raises(ConfigError, match="ekf keeps no whole graph; use batch"):
+        fg.graph(world.log, "ekf")
 
 
 def test_stereo_factor_of_a_users_keeps_its_place_on_the_body(rng: np.random.Generator) -> None:

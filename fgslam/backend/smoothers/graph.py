@@ -13,7 +13,7 @@ import dataclasses
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -35,7 +35,15 @@ from fgslam.backend.smoothers.bundle import Sightings, State, Turn, TurnedStep, 
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.correction import FIELD_PX, RigCorrection
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log, transform_to_world
+from fgslam.core.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    reorthonormalise,
+    se3_exp,
+    se3_log,
+    transform_to_world,
+)
 from fgslam.core.sensors import (
     CameraRig,
     Increment,
@@ -586,6 +594,39 @@ class Solution:
     noise_ratio: float = 1.0
     gyroscope: GyroscopeBias | None = None
     relative: Mapping[int, FloatArray] = field(default_factory=dict)
+
+
+class FactorGraph(NamedTuple):
+    """A drive as GTSAM has it, to go on with by its means.
+
+    Attributes:
+        graph: gtsam.NonlinearFactorGraph, of C++ factors where GTSAM has them.
+        values: gtsam.Values at the estimator's solution.
+        poses: keys of the poses ``wTc`` (gtsam.Pose3), by the frame's place in the log.
+        landmarks: keys of the world points (gtsam.Point3), by identity.
+    """
+
+    graph: Any
+    values: Any
+    poses: dict[int, int]
+    landmarks: dict[int, int]
+
+
+def factor_graph(builder: GraphBuilder, found: Solution) -> FactorGraph:
+    """All factors but those of landmarks that the solution left out."""
+    poses = {frame: pose_key(frame) for frame in builder.frames}
+    identities = ((builder.identities[variable], variable) for variable in found.points)
+    landmarks = {identity: landmark_key(variable) for identity, variable in identities}
+    values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for frame, key in poses.items():
+        values.insert(key, gtsam.Pose3(reorthonormalise(found.poses[frame])))
+    for variable, point in found.points.items():
+        values.insert(landmark_key(variable), point)
+    every = builder.kept_factors()
+    for factor in map(every.at, range(every.size())):
+        if all(map(values.exists, factor.keys())):
+            graph.add(factor)
+    return FactorGraph(graph, values, poses, landmarks)
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:

@@ -29,12 +29,14 @@ from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
 from fgslam.backend.smoothers.bundle import Turn
 from fgslam.backend.smoothers.graph import (
+    FactorGraph,
     GraphBuilder,
     GraphSolver,
     Smoothed,
     Solution,
     TrackedFrame,
     carried_to,
+    factor_graph,
 )
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.window import WindowValues
@@ -403,6 +405,10 @@ def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
 
 class MapSmoother(Smoother):
     """A smoother that keeps its whole graph, and so can begin in a saved map (``MapUser``)."""
+
+    def graph(self) -> FactorGraph:
+        """The graph so far, at its solution."""
+        return factor_graph(self.builder, self.solver.solution())
 
     @property
     def keeps_maps(self) -> bool:
