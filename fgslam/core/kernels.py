@@ -73,12 +73,12 @@ class Kernel:
     @property
     def is_made(self) -> bool:
         """Whether calling it takes no more than loading."""
-        return self._call is not None or find_spec("numba") is None or self._kept() is not None
+        return self._call is not None or not _has_numba() or self._kept() is not None
 
     def load(self) -> None:
         """Loads the machine code, which is made where the cache does not have it."""
-        self._call = self.numpy
-        if find_spec("numba") is None or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+        if not _has_numba():
+            self._call = self.numpy
             return
         import llvmlite.binding as llvm
 
@@ -91,7 +91,8 @@ class Kernel:
             words = 5 + 2 * (kind.count(",") + 1)
             types += [ctypes.c_int64] * words if "[" in kind else [_NUMBERS[kind]]
         address = engine.get_function_address(self._code.__name__)
-        self._call, self._engine = ctypes.CFUNCTYPE(ctypes.c_int32, *types)(address), engine
+        self._engine = engine  # before the call: another thread may wait for that
+        self._call = ctypes.CFUNCTYPE(ctypes.c_int32, *types)(address)
 
     def _made(self) -> bytes:
         """The machine code, by numba; kept where the cache can be written."""
@@ -163,6 +164,11 @@ def make_kernels(progress: Callable[[str, int, int], None]) -> None:
     for done, kernel in enumerate(missing, 1):
         kernel.load()
         progress("compiling (once)", done, len(missing))
+
+
+def _has_numba() -> bool:
+    """Whether it is installed, and not switched off by its own variable."""
+    return find_spec("numba") is not None and os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
 
 
 def processor() -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib import util
 from pathlib import Path
 from typing import Any
@@ -99,9 +100,18 @@ def test_numpy_takes_its_place_without_numba(
     else:
         monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     kernel = Kernel(add_squares, add_squares_numpy, KINDS, square)
-    make_kernels(lambda what, done, total: None)
+    made: list[tuple[str, int, int]] = []
+    make_kernels(lambda *step: made.append(step))
     np.testing.assert_array_equal(sums_of(kernel), EXPECTED + 1.0)
+    assert not made
     assert not cache.exists()
+
+
+def test_threads_that_call_first_at_one_time_get_the_same_bytes(cache: Path) -> None:
+    kernel = Kernel(add_squares, add_squares_numpy, KINDS, square)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: sums_of(kernel), range(8)))
+    np.testing.assert_array_equal(found, np.tile(EXPECTED, (8, 1)))
 
 
 def test_code_for_another_processor_is_other_code(
