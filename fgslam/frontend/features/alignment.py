@@ -87,7 +87,7 @@ def _align_numpy(  # noqa: PLR0913
     size = int(math.sqrt(len(weight)))
     x, y = offsets(size)
     middle = np.s_[:, 1:-1, 1:-1]
-    first_look = cut.reshape(-1, size + 2, size + 2)[middle].reshape(len(cut), -1)
+    first_look = cut.reshape(-1, size + 2, size + 2)[middle].reshape(len(cut), size**2)
     weighted = weight * every_term(cut, size)
     one, first = gram[:, :, 0], gram[:, :, 1]
     total = one[:, 0]
@@ -104,7 +104,7 @@ def _align_numpy(  # noqa: PLR0913
         unlike = np.sqrt((rest * rest) @ weight / total) / np.maximum(contrast, FLAT)
         of_rest = (p - offset[:, None] * one) / gain[:, None] - first
         change = (inverse @ of_rest[:, :, None])[:, :, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):  # crushed to nothing by one step: lost
+        with np.errstate(all="ignore"):  # crushed to nothing by one step: lost
             a, b, c, d = 1.0 + change[:, 4], change[:, 5], change[:, 6], 1.0 + change[:, 7]
             inverted = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
             moved = maps @ inverted.transpose(2, 0, 1)

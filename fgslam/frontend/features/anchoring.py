@@ -99,6 +99,8 @@ def offsets(size: int) -> tuple[FloatArray, FloatArray]:
 
 def remapped(grey: Float32, columns: FloatArray, rows: FloatArray) -> Float32:
     """Grey values (n, m) between pixels; n below 32767."""
+    if not columns.size:  # OpenCV refuses empty maps
+        return np.empty(columns.shape, np.float32)
     at = columns.astype(np.float32), rows.astype(np.float32)
     seen = cv2.remap(grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(seen, np.float32)
@@ -108,9 +110,9 @@ def every_term(cut: Float32, size: int) -> FloatArray:
     """(n, 8, m) b of all pixels of all patches."""
     wide = cut.reshape(-1, size + 2, size + 2).astype(np.float64)
     middle, (x, y) = slice(1, -1), offsets(size)
-    across = (0.5 * (wide[:, middle, 2:] - wide[:, middle, :-2])).reshape(len(cut), -1)
-    down = (0.5 * (wide[:, 2:, middle] - wide[:, :-2, middle])).reshape(len(cut), -1)
-    first = wide[:, middle, middle].reshape(len(cut), -1)
+    across = (0.5 * (wide[:, middle, 2:] - wide[:, middle, :-2])).reshape(len(cut), size**2)
+    down = (0.5 * (wide[:, 2:, middle] - wide[:, :-2, middle])).reshape(len(cut), size**2)
+    first = wide[:, middle, middle].reshape(len(cut), size**2)
     parts = (np.ones_like(first), first, across, down)
     return np.stack([*parts, across * x, across * y, down * x, down * y], axis=1)
 

@@ -62,6 +62,19 @@ def test_steps_are_those_of_numpy(times: int) -> None:
     assert np.median(np.abs(found[0][1] - PLACES)) < (0.2 if times == 1 else 0.05)
 
 
+def test_no_patch_is_nothing_to_do_for_either() -> None:
+    cut, gram, inverse = (one[:0].copy() for one in cut_and_added())
+    places, maps, alike = np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0)
+    room = np.empty((SIZE**2 + 2, 8)), np.empty(SIZE**2)
+    for cutting, adding, aligning in (
+        (cut_patches, add_up, align_patches),
+        (cut_patches.numpy, add_up.numpy, align_patches.numpy),
+    ):
+        cutting(GREY, 2, places, np.eye(2), SIZE + 2, cut)
+        adding(cut, SIZE, WEIGHT, PRIOR, gram, inverse, room[0][:-2])
+        aligning(GREY, 2, cut, WEIGHT, gram, inverse, 2, maps, places, alike, *room)
+
+
 def test_places_that_are_no_numbers_are_lost() -> None:
     cut, gram, inverse = (one[:3].copy() for one in cut_and_added())
     places = np.array([[np.nan, 3.0], [np.inf, 3.0], [3.0, -np.inf]])
