@@ -17,8 +17,12 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines, read_text
+from fgslam.core.geometry import compose_covariance
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.factors.graphs import solver_parameters
+from fgslam.factors.models import RangeBearing
 
 _IN_SPACE = re.compile(r"^(EDGE3|VERTEX3|EDGE_SE3|VERTEX_SE3)", re.MULTILINE)
 _TAGS = (
@@ -31,6 +35,7 @@ _LANDMARK = 1 << 56  # keys of landmarks have a character
 _FIRST_SIGMA = 1e-4  # radians and metres: the first pose is the world's
 _SHOWN = 40  # poses whose covariances are found
 _PLANAR = np.array([3, 4, 2])  # of GTSAM's x, y, turn among [rotation, translation]
+_STIFF = 1e-8  # radians and metres squared
 _CITY_SIGMAS = np.array([1.0 / 30.0, 1.0 / 30.0, 1.0 / 100.0])  # GTSAM's example of this file
 
 
@@ -122,7 +127,7 @@ def solve_by_steps(graph: StepGraph) -> SolvedGraph:
     """
     solver, known, seconds = gtsam.ISAM2(gtsam.ISAM2Params()), dict[int, Any](), []
     new, starts = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    first = min(min(one.keys()) for factors in graph.steps.values() for one in factors)
+    first = _first(graph)
     new.add(_prior(graph, first))
     known[first] = _origin(graph, first)
     starts.insert(first, known[first])
@@ -160,6 +165,41 @@ def motions_chained(path: Path) -> FloatArray:
     return np.array(list(poses.values()))
 
 
+def log_of(graph: StepGraph) -> MeasurementLog:
+    """What a graph measures of landmarks in the plane, for every estimator.
+
+    A frame for each pose that sees any, with the edges since the last one as its odometry; what a
+    plane excludes is stiff.
+
+    Raises:
+        DatasetError: an edge closes a loop, which a log does not hold, or the graph is in space.
+    """
+    log, model = MeasurementLog(), RangeBearing()
+    motion, noise, before = np.eye(4), np.zeros((6, 6)), _first(graph)
+    for key, factors in {before: [], **graph.steps}.items():
+        seen = [one for one in factors if max(one.keys()) >= _LANDMARK]
+        for one in (one for one in factors if max(one.keys()) < _LANDMARK):
+            if not graph.planar or list(one.keys()) != [before, key]:
+                raise DatasetError(f"the edge to pose {key} closes a loop: solve it as a graph")
+            added = _STIFF * np.eye(6)
+            added[np.ix_(_PLANAR, _PLANAR)] = one.noiseModel().covariance()
+            step, before = _matrix(one.measured()), key
+            motion, noise = motion @ step, compose_covariance(step, noise, added)
+        if seen or not len(log):
+            found = [one.measured() for one in seen]
+            values = np.array([(z.range(), z.bearing().theta(), 0.0) for z in found]).reshape(-1, 3)
+            bearing, distance = (
+                np.array([one.noiseModel().sigmas() for one in seen]).reshape(-1, 2).T
+            )
+            spread = np.column_stack([distance**2, bearing**2, np.full(len(seen), _STIFF)])
+            ids = [max(one.keys()) % _LANDMARK for one in seen]
+            measured = [model.measured(values, spread[:, :, None] * np.eye(3), ids)] if seen else []
+            odometry = Odometry(motion, noise) if len(log) else None
+            log.append(Increment.of(key, float(key), odometry, measured))
+            motion, noise = np.eye(4), np.zeros((6, 6))
+    return log
+
+
 def _begun(graph: StepGraph, factor: Any, key: int, known: dict[int, Any]) -> Any:
     """Where a variable begins: at the other end of its first edge."""
     a, b = (*factor.keys(), -1)[:2]
@@ -176,6 +216,10 @@ def _begun(graph: StepGraph, factor: Any, key: int, known: dict[int, Any]) -> An
         f"variable {key % _LANDMARK} has no edge to an earlier one from which it could begin; "
         "number the poses along the drive, with an edge from each to the next"
     )
+
+
+def _first(graph: StepGraph) -> int:
+    return int(min(min(one.keys()) for factors in graph.steps.values() for one in factors))
 
 
 def _origin(graph: StepGraph, first: int) -> Any:

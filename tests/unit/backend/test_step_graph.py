@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.backend.step_graph import motions_chained, read_graph, solve_at_once, solve_by_steps
+import fgslam as fg
+from fgslam.backend.step_graph import (
+    log_of,
+    motions_chained,
+    read_graph,
+    solve_at_once,
+    solve_by_steps,
+)
 from fgslam.core.errors import DatasetError
 
 SQUARE = "".join(
@@ -56,6 +63,26 @@ def test_landmarks_in_space_begin_at_their_first_sighting(tmp_path: Path) -> Non
     found = solve_by_steps(read_graph(written(tmp_path, text)))
     assert found.chi_square == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(found.estimate.trajectory.poses[1][:3, 3], [1, 0, 0], atol=1e-6)
+
+
+def test_landmarks_in_the_plane_are_a_log_with_the_same_answer(tmp_path: Path) -> None:
+    """The EKF's last pose is that of the whole graph; a loop's edge is no measurement of a log."""
+    sightings = "".join(
+        f"BR {k} {100 + n} {np.arctan2(y, x - k):.6f} {np.hypot(x - k, y):.6f} 0.02 0.05\n"
+        for k in range(0, 6, 2) for n, (x, y) in enumerate([(3.0, 2.0), (4.0, -2.0), (8.0, 1.0)])
+    )  # fmt: skip
+    moves = "".join(
+        f"ODOMETRY {k} {k + 1} 1.02 0.01 0.01 0.01 0 0 0.01 0 0.001\n" for k in range(5)
+    )
+    graph = read_graph(written(tmp_path, moves + sightings, "a.txt"))
+    log = log_of(graph)
+    assert [one.index for one in log] == [0, 2, 4]
+    assert [len(one.measured[0].ids) for one in log] == [3, 3, 3]
+    found = fg.replay(log, "ekf").estimate.trajectory
+    whole = solve_at_once(graph, solve_by_steps(graph).values).estimate.trajectory
+    np.testing.assert_allclose(found.poses[2], whole.poses[4], atol=5e-3)
+    with pytest.raises(DatasetError, match="the edge to pose 4 closes a loop: solve it as a graph"):
+        log_of(read_graph(written(tmp_path, CLOSED)))
 
 
 def test_motions_are_chained_without_what_closes_loops(tmp_path: Path) -> None:
