@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.evidence import (
     chess,
     compact_memory,
+    dense,
     drives,
     euroc_raw,
     false_matches,
@@ -54,6 +55,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "variants": lambda data: [variants.table(data)],
     "paired": lambda data: [variants.paired_table()],
     "real": lambda data: [drives.real_table(data)],
+    "dense": dense.tables,
     "euroc_raw": euroc_raw.tables,
     "hybrid": hybrid.tables,
     "front_ends": front_ends.tables,

@@ -501,6 +501,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
     max_range: float | None = None,
     cameras: int | None = None,
     every: int = 2,
+    sigma: float | None = None,
     recording: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -529,6 +530,8 @@ def export(  # noqa: PLR0913 - each option is a parameter
         max_range (--range METRES): farthest depth; default by the cameras' precision
         cameras: 2 leaves the top camera out
         every: of the frames every so many are matched densely
+        sigma (METRES): what is known less well is left out of --dense and --mesh; default 1.5
+            voxels
         recording: where the run's recording is now; default where it was, or next to the run
         overwrite: replace an earlier one
     """
@@ -549,7 +552,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
         dense=dense,
         mesh=mesh,
         grid=grid,
-        how=DenseSettings(voxel, max_range, cameras, every),
+        how=DenseSettings(voxel, max_range, cameras, every, sigma),
         recording=recording,
         overwrite=overwrite,
     )

@@ -277,37 +277,12 @@ def _as_records(columns: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.void]:
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 """Grey values of Nav2's map server, as `trinary` reads them."""
 _OBSTACLE_M = (0.1, 2.0)  # heights above the floor; the higher one is Nav2's
-_HIT, _MISS, _MOST = 0.85, -0.4, 4.0  # log-odds (Hornung et al. 2013), clipped
-_VERTICES = 3  # of the surface, from which on a cell is occupied
-_EVERY = 2  # of the rows and columns of a depth image
+_POINTS = 2  # vertices and middles of triangles, from which on a cell is occupied
+_CROSSINGS = 3  # by scans, from which on a cell is free
 _NEAREST = 3  # obstacle of a column, counted from the camera: nearer ones may be wrong matches
 _TILTS_DEG = (40.0, 30.0, 20.0, 20.0, 10.0, 10.0)  # of the floor's normals, ever nearer
 _FEWEST, _NEAR_STEPS = 50, 2.0
 _FLOOR_SHARE = 0.25  # of the level that has most
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ColumnScan:
-    """What is kept of a depth image for the grid: some rows and columns.
-
-    Attributes:
-        depth: (r, c) metres, 0 where there is none.
-        sigma: (r, c) of the inverse depth, 1/m.
-        rays: (r, c, 3) of depth one.
-        wTc: (4, 4) of the camera.
-    """
-
-    depth: npt.NDArray[np.float16]
-    sigma: npt.NDArray[np.float16]
-    rays: Float32
-    wTc: FloatArray
-
-
-def scan_columns(frame: DepthFrame, rays: Float32) -> ColumnScan:
-    """Every so many rows and columns of a depth image, at half precision."""
-    some = slice(None, None, _EVERY), slice(None, None, _EVERY)
-    depth, sigma = (a[some].astype(np.float16) for a in (frame.depth, frame.sigma))
-    return ColumnScan(depth, sigma, rays[some], frame.wTc)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -383,7 +358,8 @@ def find_floor(
 
 def make_grid(
     surface: Surface,
-    scans: Sequence[ColumnScan],
+    scans: Sequence[tuple[npt.NDArray[Any], FloatArray]],
+    rays: Float32,
     up: FloatArray,
     floor_m: float,
     resolution_m: float,
@@ -392,54 +368,68 @@ def make_grid(
 
     Args:
         surface: of the drive: what it has carved away was there for some time only.
-        scans: of the drive, in its order.
+        scans: some rows and columns of each depth image (r, c), 0 where there is none, and the
+            camera's pose (4, 4).
+        rays: (r, c, 3) of depth one.
         up: (3,) unit vector in the map.
         floor_m: height of the floor along it.
         resolution_m: side of a cell.
     """
-    wRg = _level_axes(up)
-    hits, free = [], []
-    for scan in scans:
-        end, occupied, weight = _ends(scan, wRg, floor_m, resolution_m)
-        start = (wRg.T @ scan.wTc[:3, 3])[:2]
-        way = np.linalg.norm(end - start, axis=1)
-        steps = np.arange(0.0, way.max(initial=0.0), 0.5 * resolution_m)
-        along = np.minimum(steps, np.maximum(way - occupied * resolution_m, 0.0)[:, None])
-        unit = (end - start) / np.maximum(way, 1e-9)[:, None]
-        cells = np.floor((start + along[..., None] * unit[:, None]) / resolution_m).astype(np.int64)
-        free.append(np.unique(cells.reshape(-1, 2), axis=0))
-        at = np.floor(end[occupied] / resolution_m).astype(np.int64)
-        at, first = np.unique(at, axis=0, return_index=True)
-        hits.append((at, weight[occupied][first]))
-    points = surface.positions @ wRg
-    height, (low_m, high_m) = points[:, 2] - floor_m, _obstacle_heights(resolution_m)
-    standing = points[(height > low_m) & (height < high_m), :2]
-    standing, count = np.unique(
-        np.floor(standing / resolution_m).astype(np.int64), axis=0, return_counts=True
-    )
-    standing = standing[count >= _VERTICES]
-    everything = np.concatenate(
-        [np.zeros((1, 2), np.int64), *free, standing, *(at for at, _ in hits)]
-    )
-    low, high = everything.min(axis=0), everything.max(axis=0) + 1
-    odds = np.zeros(tuple(high - low), np.float32)
-    seen = np.zeros(odds.shape, np.bool_)
-    for missed, (at, weight) in zip(free, hits, strict=True):
-        change = np.zeros_like(odds)
-        change[tuple((missed - low).T)] = _MISS
-        change[tuple((at - low).T)] = _HIT * weight
-        odds = np.clip(odds + change, -_MOST, _MOST)
-        seen |= change != 0.0
-    cells = np.full(odds.shape, UNKNOWN, np.uint8)
-    cells[seen & (odds < 0.0)] = FREE
-    cells[tuple((standing - low).T)] = OCCUPIED
+    wRg, heights = _level_axes(up), (max(_OBSTACLE_M[0], 2.0 * resolution_m), _OBSTACLE_M[1])
+    middles = surface.positions[surface.triangles].mean(axis=1)
+    points = np.concatenate([surface.positions, middles]) @ wRg
+    points = points[(points[:, 2] > floor_m + heights[0]) & (points[:, 2] < floor_m + heights[1])]
+    occupied = _often(np.floor(points[:, :2] / resolution_m), _POINTS)
+    crossed = [
+        _crossed(
+            np.float64(rays) * depth[..., None], wRg.T @ wTc[:3], floor_m, heights, resolution_m
+        )
+        for depth, wTc in scans
+    ]
+    free = _often(np.concatenate(crossed), _CROSSINGS)
+    everything = np.concatenate([np.zeros((1, 2), np.int64), free, occupied])
+    low = everything.min(axis=0)
+    cells = np.full(everything.max(axis=0) - low + 1, UNKNOWN, np.uint8)
+    cells[tuple((free - low).T)] = FREE
+    cells[tuple((occupied - low).T)] = OCCUPIED
     x, y = (low * resolution_m).tolist()
     return Grid(np.ascontiguousarray(cells.T[::-1]), resolution_m, (x, y), wRg, floor_m)
 
 
-def _obstacle_heights(resolution_m: float) -> tuple[float, float]:
-    """Lowest and highest height above the floor, metres, of what a robot runs into."""
-    return max(_OBSTACLE_M[0], 2.0 * resolution_m), _OBSTACLE_M[1]
+def _often(cells: FloatArray, times: int) -> IntArray:
+    """Those of cells (n, 2) that are there so many times."""
+    found, count = np.unique(cells.astype(np.int64), axis=0, return_counts=True)
+    return found[count >= times]
+
+
+def _crossed(
+    points: FloatArray,
+    gTc: FloatArray,
+    floor_m: float,
+    heights: tuple[float, float],
+    resolution_m: float,
+) -> FloatArray:
+    """Cells (n, 2) that a scan sees across: of each column to the farthest floor before obstacles.
+
+    Args:
+        points: (r, c, 3) in the camera's frame, zero where there is none.
+        gTc: (3, 4) pose of the camera in the grid's axes.
+        floor_m: height of the floor.
+        heights: lowest and highest above it of an obstacle.
+        resolution_m: side of a cell.
+    """
+    ahead = points @ gTc[:, :3].T
+    height, way = ahead[..., 2] + gTc[2, 3] - floor_m, np.hypot(ahead[..., 0], ahead[..., 1])
+    known = points[..., 2] > 0.0
+    blocked = np.where(known & (height > heights[0]) & (height < heights[1]), way, np.inf)
+    blocked = np.sort(blocked, axis=0)[min(_NEAREST, len(way)) - 1]
+    floor = known & (np.abs(height) <= heights[0]) & (way < blocked)
+    far = np.where(floor, way, np.where(way == blocked, way - resolution_m, 0.0))
+    at = far.argmax(axis=0), np.arange(far.shape[1])
+    unit = ahead[at][:, :2] / np.maximum(way[at], resolution_m)[:, None]
+    along = np.minimum(np.arange(0.0, far.max(), 0.5 * resolution_m), far[at][:, None])
+    places = gTc[:2, 3] + along[..., None] * unit[:, None]
+    return np.unique(np.floor(places.reshape(-1, 2) / resolution_m), axis=0)
 
 
 def _level_axes(up: FloatArray) -> FloatArray:
@@ -448,34 +438,3 @@ def _level_axes(up: FloatArray) -> FloatArray:
     axis, cosine = np.cross(level[:, 2], up), float(level[:, 2] @ up)
     turn = np.eye(3) + skew(axis) + skew(axis) @ skew(axis) / max(1.0 + cosine, 1e-9)
     return np.asarray(turn @ level)
-
-
-def _ends(
-    scan: ColumnScan, wRg: FloatArray, floor_m: float, resolution_m: float
-) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Of each column that sees something: where (k, 2), whether an obstacle, and its weight (k,).
-
-    The farthest floor, or an obstacle before it.
-    """
-    depth = scan.depth.astype(np.float64)
-    gTc = wRg.T @ scan.wTc[:3, :3]
-    start = wRg.T @ scan.wTc[:3, 3]
-    points = (scan.rays * depth[..., None]) @ gTc.T + start
-    height, way = points[..., 2] - floor_m, np.hypot(*(points - start)[..., :2].transpose(2, 0, 1))
-    known = depth > 0.0
-    low, high = _obstacle_heights(resolution_m)
-    obstacle = known & (height > low) & (height < high)
-    floor = known & (np.abs(height) <= low)
-    ranked = np.sort(np.where(obstacle, way, np.inf), axis=0)[min(_NEAREST, len(way)) - 1]
-    occupied = np.isfinite(ranked)
-    at = np.argmin(
-        np.where(obstacle, np.abs(way - np.where(occupied, ranked, 0.0)), np.inf), axis=0
-    )
-    farthest = np.argmax(np.where(floor & (way < ranked), way, -1.0), axis=0)
-    row = np.where(occupied, at, farthest)
-    columns = np.arange(depth.shape[1])
-    use = occupied | floor[farthest, columns]
-    row, columns = row[use], columns[use]
-    sigma = scan.sigma[row, columns].astype(np.float64) * depth[row, columns] ** 2
-    weight = 1.0 / (1.0 + (sigma / resolution_m) ** 2)
-    return points[row, columns, :2], occupied[use], weight

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TypeAlias, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.correction import EXPECTED_PX, FIELD_PX, SHARED, shared_information
@@ -21,7 +22,6 @@ from fgslam.frontend.dense_stereo import MIN_DISPARITY_PX, DenseStereo
 from fgslam.report.surface import (
     KEPT_SIGMA_VOXELS,
     TRUNCATION_VOXELS,
-    ColumnScan,
     DepthFrame,
     Float32,
     Fusion,
@@ -29,10 +29,10 @@ from fgslam.report.surface import (
     Surface,
     find_floor,
     make_grid,
-    scan_columns,
 )
 from fgslam.runs.units import Progress
 
+Float16: TypeAlias = npt.NDArray[np.float16]
 Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of a selected frame, grey or in red, green, blue; or FrameError."""
 
@@ -56,15 +56,18 @@ class DenseSettings:
             of a pixel is four voxels.
         cameras: 2 leaves the top camera out.
         every: of the frames that have a pose, every so many are used.
+        sigma_m: what is known less well to its neighbours is left out; None: 1.5 voxels.
     """
 
     voxel_m: float | None = None
     range_m: float | None = None
     cameras: int | None = None
     every: int = 2
+    sigma_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("voxel", self.voxel_m), ("range", self.range_m)):
+        lengths = {"voxel": self.voxel_m, "range": self.range_m, "sigma": self.sigma_m}
+        for name, value in lengths.items():
             if value is not None and not 0.0 < value < np.inf:
                 raise ConfigError(f"--{name} is {value:g}; give metres above 0, or leave it out")
         if self.cameras not in (None, 2, 3):
@@ -84,7 +87,8 @@ class DenseMap:
         voxel_m: side of a voxel, and of the grid's cells.
         range_m: farthest depth that was used.
         frames: how many depth images were fused.
-        scans: of each, what the grid is made from.
+        scans: of each every second row and column, metres, and the pose (4, 4) of its camera.
+        rays: (r, c, 3) of theirs, of depth one.
         up: (3,) mean upward direction of the body or the camera, in the map.
         level: whether it is that of a body that keeps to it, as on wheels.
     """
@@ -93,7 +97,8 @@ class DenseMap:
     voxel_m: float
     range_m: float
     frames: int
-    scans: tuple[ColumnScan, ...]
+    scans: tuple[tuple[Float16, FloatArray], ...]
+    rays: Float32
     up: FloatArray
     level: bool
 
@@ -101,7 +106,7 @@ class DenseMap:
     def grid(self) -> Grid:
         """Free, occupied and unknown cells of the floor."""
         up, floor = find_floor(self.surface, self.up, self.level, 2.0 * self.voxel_m)
-        return make_grid(self.surface, self.scans, up, floor, self.voxel_m)
+        return make_grid(self.surface, self.scans, self.rays, up, floor, self.voxel_m)
 
 
 Measured: TypeAlias = Callable[[int], tuple[Depth, Float32, Image]]
@@ -189,7 +194,7 @@ def fuse(
             "it out"
         )
     most = settings.range_m or min(farthest, float(np.sqrt(TRUNCATION_VOXELS * voxel / noise)))
-    fusion, scans, rays = Fusion(_matrix(rig), voxel), [], _rays(rig)
+    fusion, scans = Fusion(_matrix(rig), voxel), []
     for done, k in enumerate(used):
         progress("fusing", done, len(used))
         try:
@@ -201,12 +206,13 @@ def fuse(
         shared = _shared(log, estimate.covariances[k], depth)
         frame = DepthFrame(depth, sigma, image, estimate.trajectory.poses[k], shared)
         fusion.add(frame)
-        scans.append(scan_columns(frame, rays))
+        scans.append((depth[::2, ::2].astype(np.float16), frame.wTc))
     progress("fusing", len(used), len(used))
-    surface = fusion.surface(KEPT_SIGMA_VOXELS * voxel)
+    kept = settings.sigma_m or KEPT_SIGMA_VOXELS * voxel
+    surface = fusion.surface(kept)
     if not len(surface.positions):
         raise DatasetError(
-            f"nothing was seen as well as {100.0 * KEPT_SIGMA_VOXELS * voxel:.3g} cm within "
+            f"nothing was seen as well as {100.0 * kept:.3g} cm within "
             f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g}) or a larger --range"
         )
     mounted = not body_is_camera(rig.bTc)
@@ -215,7 +221,7 @@ def fuse(
     # What keeps to its vertical is on wheels.
     length = float(np.linalg.norm(up))
     level = mounted and length > _LEVEL
-    return DenseMap(surface, voxel, most, len(scans), tuple(scans), up / length, level)
+    return DenseMap(surface, voxel, most, len(scans), tuple(scans), _rays(rig), up / length, level)
 
 
 def _readable(read: Callable[[int], _Read], rows: Sequence[int]) -> list[_Read]:
@@ -234,8 +240,8 @@ def _matrix(rig: CameraRig) -> FloatArray:
 
 
 def _rays(rig: CameraRig) -> Float32:
-    """(height, width, 3) of depth one."""
-    rows, columns = np.indices((rig.height, rig.width), np.float32)
+    """Of every second row and column, of depth one."""
+    rows, columns = np.indices((rig.height, rig.width), np.float32)[:, ::2, ::2]
     rays = [(columns - rig.cx) / rig.fx, (rows - rig.cy) / rig.fy, np.ones_like(rows)]
     return np.stack(rays, axis=-1).astype(np.float32)
 

@@ -13,17 +13,18 @@ import yaml
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
-from fgslam.cameras.rig import require_rig
+from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core import __version__
-from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.checks import require_flag, require_seed
 from fgslam.core.errors import ConfigError, MapError, OutputError
 from fgslam.core.files import as_path, require_output
 from fgslam.core.geometry import so3_log
 from fgslam.core.log import Frame
+from fgslam.core.open3d_library import load_open3d
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Estimate, LandmarkMap, Relocalisation, Trajectory
 from fgslam.datasets.layouts import is_recording
@@ -31,7 +32,7 @@ from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.report.content import sentence
-from fgslam.report.formats import MapPoints, write_map
+from fgslam.report.formats import Axes, MapPoints, write_map
 from fgslam.runs.bare import bare_experiment
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.named_experiments import find_experiment
@@ -47,9 +48,9 @@ from fgslam.slam.build import (
 )
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.motion import MotionModel
-from fgslam.slam.results import SessionResult
+from fgslam.slam.results import SessionResult, Step
 from fgslam.slam.rig_memory import RigMemory
-from fgslam.slam.session import Session, checked_images
+from fgslam.slam.session import Images, Session, checked_images
 from fgslam.slam.settings import MapSettings
 
 # ------------------------------------------------------------------------------------------
@@ -87,12 +88,13 @@ class Map:
         saved = load_map(as_path(path, MapError))
         return Map(saved, points_of(saved), remark_of_map(saved))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, axes: Axes = "camera") -> None:
         """Writes the map in the format that the suffix names.
 
-        `.fgmap` holds all of it, for :meth:`load`; `.ply` and `.pcd` are point clouds for
-        other tools, in the world: x right, y down, z forward, metres. The same map gives the same
-        bytes; a file is written whole or not at all.
+        `.fgmap` holds all of it but colours, for :meth:`load`; `.ply` and `.pcd` are point clouds
+        for other tools, in the world: x right, y down, z forward, or with ``axes="ros"`` x forward,
+        y left, z up; metres. The same map gives the same bytes; a file is written whole or not at
+        all.
 
         Raises:
             OutputError: the suffix is another one, or the file cannot be written.
@@ -101,7 +103,7 @@ class Map:
         if path.suffix.lower() == _SUFFIX:
             save_map(self.saved, path)
         elif path.suffix.lower() in (".ply", ".pcd"):
-            write_map(path, self.points, self.remark)
+            write_map(path, self.points, self.remark, axes)
         else:
             raise OutputError(
                 f"cannot write {path}: unknown map format '{path.suffix}'; use .fgmap, .ply or .pcd"
@@ -166,6 +168,40 @@ class Map:
     def covariances(self) -> FloatArray:
         """(n, 3, 3) of the positions, metres squared."""
         return self.points.covariances
+
+    @property
+    def ids(self) -> IntArray:
+        """(n,) identities of the landmarks, ascending."""
+        return self.points.ids
+
+    @property
+    def colours(self) -> ByteArray:
+        """(n, 3) red, green, blue where each was first seen, uint8; grey from grey images."""
+        return self.points.colours
+
+    def to_open3d(self) -> Any:
+        """The landmarks as an ``open3d.t.geometry.PointCloud``.
+
+        Besides positions and colours it has ``landmark_id``, ``hits``, ``valid`` and ``covariance``
+        (n, 9), row by row.
+
+        Raises:
+            MissingDependencyError: Open3D or a system library it needs is absent.
+        """
+        o3d, points = load_open3d(), self.points
+        cloud = o3d.t.geometry.PointCloud()
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "positions": points.positions,
+            "colors": points.colours,
+            "landmark_id": points.ids,
+            "hits": points.hits,
+            "valid": points.valid,
+            "covariance": points.covariances,
+        }
+        for name, values in arrays.items():
+            flat = np.ascontiguousarray(values.reshape(len(points), -1))
+            cloud.point[name] = o3d.core.Tensor(flat)
+        return cloud
 
     @property
     def rig(self) -> CameraRig:
@@ -406,6 +442,7 @@ class Slam(Session):
                 "map of a result"
             )
         self._before = None if start_map is None else start_map.saved
+        self._colours: dict[int, ByteArray] = {}  # of landmarks that images in colour began
         super().__init__(
             rig,
             estimator,
@@ -459,6 +496,24 @@ class Slam(Session):
         slam._remark = settings.remark
         return slam
 
+    def track(
+        self,
+        t: float,
+        images: Images | None,
+        odometry: Odometry | npt.ArrayLike | None = None,
+    ) -> Step:
+        """As :meth:`fgslam.slam.session.Session.track`; the map keeps the colours of images."""
+        step = super().track(t, images, odometry)
+        if images is not None and np.ndim(images[1]) == 3 and len(self.recorder):
+            seen = self.recorder.log.increments[-1].observations
+            new = seen.select(seen.is_new)
+            left, right, *top = map(_eight_bits, images)
+            if isinstance(self.rig, StereoRig):
+                right = self.rig.rectified((right, left, *top))[0]
+            column, row = np.rint(new.pixels[:, 0]).astype(np.int64).T
+            self._colours |= dict(zip(new.ids.tolist(), right[row, column, :3], strict=True))
+        return step
+
     def result(self) -> Result:
         """Trajectory, covariances, map and remarks as known now; tracking may go on afterwards.
 
@@ -467,11 +522,18 @@ class Slam(Session):
         """
         found = super().result()
         points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
+        for row, identity in enumerate(points.ids.tolist()):
+            points.colours[row] = self._colours.get(identity, points.colours[row])
         drive = {"remark": self._remark, "remarks": list(map(sentence, found.remarks))}
         saved = map_of(self, found.estimate, self._before, name="session", **drive)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         values["notes"] = tuple(map(sentence, found.notes))
         return Result(**values, map=Map(saved, points, self._remark))
+
+
+def _eight_bits(image: npt.ArrayLike) -> Image:
+    pixels = np.asarray(image)
+    return np.asarray(pixels >> 8 if pixels.dtype == np.uint16 else pixels, np.uint8)
 
 
 def _beginning(config: ExperimentConfig) -> MapStart | None:

@@ -22,7 +22,6 @@ from fgslam.report.surface import (
     Surface,
     find_floor,
     make_grid,
-    scan_columns,
 )
 
 MATRIX = np.array([[60.0, 0.0, 39.5], [0.0, 60.0, 29.5], [0.0, 0.0, 1.0]])
@@ -162,7 +161,7 @@ def grid_of(wTc: FloatArray, post: bool = False, level: bool = False) -> Grid:
     surface = fused(frames)
     up = np.array([0.0, -1.0, 0.0]) if not level else wTc[:3, :3] @ [0.0, -1.0, 0.0]
     up, floor = find_floor(surface, up, level, 2.0 * VOXEL)
-    return make_grid(surface, [scan_columns(f, RAYS) for f in frames], up, floor, VOXEL)
+    return make_grid(surface, [(f.depth, f.wTc) for f in frames], RAYS, up, floor, VOXEL)
 
 
 def cell(grid: Grid, x: float, y: float) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from fgslam.errors import (
     MeasurementLogError,
     OutputError,
 )
+from fgslam.report.formats import read_ply
 from fgslam.runs.session import override_texts
 
 FRAMES = 6
@@ -342,3 +344,49 @@ def test_files_of_a_session_with_a_checked_rig_are_read_back(tmp_path: Path) -> 
         slam.result().map.save(tmp_path / "place.fgmap")
     assert fg.Map.load(tmp_path / "place.fgmap").rig.baseline == 0.1
     assert fg.MeasurementLog.load(tmp_path / "log.npz").rig.baseline == 0.1
+
+
+def test_a_map_has_identities_and_an_open3d_cloud(
+    driven: tuple[fg.Slam, fg.Result], open3d: ModuleType
+) -> None:
+    made = driven[1].map
+    np.testing.assert_array_equal(made.ids, driven[1].estimate.landmarks.ids)
+    cloud = made.to_open3d()
+    np.testing.assert_array_equal(cloud.point["positions"].numpy(), made.positions)
+    np.testing.assert_array_equal(cloud.point["landmark_id"].numpy()[:, 0], made.ids)
+    covariances = cloud.point["covariance"].numpy().reshape(-1, 3, 3)
+    np.testing.assert_array_equal(covariances, made.covariances)
+    assert isinstance(cloud, open3d.t.geometry.PointCloud)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_landmarks_have_the_colours_of_the_images_that_began_them(folder: Path, bits: int) -> None:
+    recording = fg.open_recording(folder)
+    plain, coloured = (fg.Slam(recording.rig, "landmark_kalman") for _ in range(2))
+    tint = np.array([1.0, 0.5, 0.25])
+    for t, images, odometry in list(recording)[:2]:
+        assert images is not None
+        seen = [np.asarray(i[:, :, None] * tint, np.uint8) for i in images]
+        given = seen if bits == 8 else [np.left_shift(i.astype(np.uint16), 8) for i in seen]
+        coloured.track(t, given, odometry)
+        plain.track(t, images, odometry)
+    colours = coloured.result().map.colours.astype(int)
+    assert len(colours) > 10
+    bright = colours[colours[:, 0] > 60]
+    assert np.abs(bright[:, 1] - bright[:, 0] / 2.0).max() <= 1.0
+    assert np.abs(bright[:, 2] - bright[:, 0] / 4.0).max() <= 1.0
+    grey = plain.result().map.colours
+    assert (grey == grey[:, :1]).all()
+    for slam in (plain, coloured):
+        slam.close()
+
+
+def test_a_map_is_saved_in_the_axes_of_ros(
+    driven: tuple[fg.Slam, fg.Result], tmp_path: Path
+) -> None:
+    made = driven[1].map
+    made.save(tmp_path / "ros.ply", axes="ros")
+    x, y, z = made.positions.T
+    np.testing.assert_allclose(
+        read_ply(tmp_path / "ros.ply").positions, np.stack([z, -x, -y], axis=1), rtol=0, atol=1e-12
+    )
