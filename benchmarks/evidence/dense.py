@@ -42,8 +42,10 @@ def tables(data: Path) -> list[Table]:
             rows.append((f"{cameras} cameras, {kept:.0f} cm", *_judged(found.surface, lab, truth)))
             if (cameras, sigma_m) == (3, None):
                 grid = _judged_grid(found, lab)
-        person = _open("lab_person")
-        trail = _trail(dense_map(_run("lab_person", Path(folder)), how=how), person)
+        how = DenseSettings(VOXEL_M)
+        trail = _trail("without a person", dense_map(run, how=how), lab)
+        with_person = dense_map(_run("lab_person", Path(folder)), how=how)
+        trail += _trail("with one", with_person, _open("lab_person"))
         out = [
             Table("The lab, voxels of 4 cm", ("", *_COLUMNS), rows),
             Table("The lab's grid, and a person", ("", "value"), [*grid, *trail]),
@@ -135,8 +137,8 @@ def _judged_grid(found: DenseMap, lab: RenderedLabSequence) -> list[tuple[Cell, 
     return [("free cells that are occupied, %", 100.0 * float(stands.mean()))]
 
 
-def _trail(found: DenseMap, lab: RenderedLabSequence) -> list[tuple[Cell, ...]]:
-    """Vertices of the person, and of them those that later frames see through."""
+def _trail(name: str, found: DenseMap, lab: RenderedLabSequence) -> list[tuple[Cell, ...]]:
+    """Vertices far from the room's surfaces, and of these those that later frames see through."""
     vertices = found.surface.positions.astype(np.float64)
     far = vertices[_to_room(vertices, lab) > _FAR_M]
     through = np.zeros(len(far), np.bool_)
@@ -150,10 +152,11 @@ def _trail(found: DenseMap, lab: RenderedLabSequence) -> list[tuple[Cell, ...]]:
         shown = (z > 0.1) & (u >= 0) & (v >= 0) & (u < rig.width) & (v < rig.height)
         depth = lab.depth(i)[v.clip(0, rig.height - 1), u.clip(0, rig.width - 1)]
         through |= shown & (depth > z + 4.0 * found.voxel_m) & (z < found.range_m)
+    shares = [100.0 * count / len(vertices) for count in (len(far), int(through.sum()))]
     return [
-        ("vertices far from the room's surfaces, %", 100.0 * len(far) / len(vertices)),
-        ("of all, those seen through later, %", 100.0 * float(through.sum()) / len(vertices)),
-    ]  # fmt: skip
+        (f"{name}: vertices far from the room's surfaces, %", shares[0]),
+        (f"{name}: those of them that are seen through later, %", shares[1]),
+    ]
 
 
 def _thickness(found: DenseMap) -> float:

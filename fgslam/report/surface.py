@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -392,6 +393,9 @@ def make_grid(
     cells = np.full(everything.max(axis=0) - low + 1, UNKNOWN, np.uint8)
     cells[tuple((free - low).T)] = FREE
     cells[tuple((occupied - low).T)] = OCCUPIED
+    # Surfaces are known to a cell or so: what is next to an obstacle is not known to be free.
+    near = cv2.dilate((cells == OCCUPIED).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    cells[near & (cells == FREE)] = UNKNOWN
     x, y = (low * resolution_m).tolist()
     return Grid(np.ascontiguousarray(cells.T[::-1]), resolution_m, (x, y), wRg, floor_m)
 

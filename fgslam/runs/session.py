@@ -504,10 +504,11 @@ class Slam(Session):
     ) -> Step:
         """As :meth:`fgslam.slam.session.Session.track`; the map keeps the colours of images."""
         step = super().track(t, images, odometry)
-        if images is not None and np.ndim(images[1]) == 3 and len(self.recorder):
+        shown = [image for image in images or () if image is not None]
+        if len(shown) == self.rig.cameras and np.ndim(shown[1]) == 3 and len(self.recorder):
             seen = self.recorder.log.increments[-1].observations
             new = seen.select(seen.is_new)
-            left, right, *top = map(_eight_bits, images)
+            left, right, *top = map(_eight_bits, shown)
             if isinstance(self.rig, StereoRig):
                 right = self.rig.rectified((right, left, *top))[0]
             column, row = np.rint(new.pixels[:, 0]).astype(np.int64).T
