@@ -23,7 +23,7 @@ SUBJECTS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "filter_or_smoother": ("Filter or smoother", ("filter_or_smoother",)),
     "robustness": ("Robustness", ("robustness", "nothing_lost")),
-    "maps": ("Maps", ("lasting_landmarks", "saved_maps", "relocalisation", "loops")),
+    "maps": ("Maps", ("dense_maps", "lasting_landmarks", "saved_maps", "relocalisation", "loops")),
     "homing": ("Homing", ("homing_vectors", "homing_drives", "homing_estimators")),
     "routes": ("Routes", ("own_routes", "topological_maps")),
     "speed": ("Speed", ("key_frames", "speed")),

@@ -502,7 +502,10 @@ class Slam(Session):
         images: Images | None,
         odometry: Odometry | npt.ArrayLike | None = None,
     ) -> Step:
-        """As :meth:`fgslam.slam.session.Session.track`; the map keeps the colours of images."""
+        """As :meth:`fgslam.slam.session.Session.track`; the map keeps colours.
+
+        Those of the right image where a landmark begins, of images (height, width, 3).
+        """
         step = super().track(t, images, odometry)
         shown = [image for image in images or () if image is not None]
         if len(shown) == self.rig.cameras and np.ndim(shown[1]) == 3 and len(self.recorder):
