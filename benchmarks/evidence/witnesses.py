@@ -494,7 +494,8 @@ def outcome(drive: Drive) -> Outcome:
     with Session(drive.rig) as slam:
         for t, images, odometry in zip(drive.stamps, drive.images, drive.odometry, strict=True):
             slam.track(float(t), images, odometry)
-        found, enough = slam.result(), located(slam.recorder, slam.pipeline.tracker.parts).enough
+        found, parts = slam.result(), slam.pipeline.tracker.parts
+        enough = located(slam.recorder, parts, slam.pipeline.calibration).enough
     last = found.trajectory.poses[-1]
     n = len(drive) - len(found.trajectory.poses)
     true = inverse(drive.truth[n]) @ drive.truth[-1]

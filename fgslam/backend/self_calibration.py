@@ -39,13 +39,15 @@ from fgslam.core.sensors import (
     vertical_to_horizontal,
 )
 from fgslam.core.store import Kept
+from fgslam.core.types import Remark
 
 WINDOW = 6
 """Frames of one window: motion enough to see depth change, few enough to cost little."""
 
 TRUSTED_WINDOWS = 4  # how many windows the stated noise and shake are worth, next to those observed
-_DECIDING = 4
+_DECIDING = 2
 """Windows after a suspected knock for which both hypotheses are kept: one rig, or two."""
+_RECENT = 6  # windows in which a knock is looked for
 _DRIFT_S = 3600.0  # seconds in which evidence fades by a factor e
 
 
@@ -70,15 +72,11 @@ class CalibrationStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """One window: what was known before it, what it shows, and its first frame.
-
-    ``unlikely``: what was known cannot explain it.
-    """
+    """One window: what was known before it, what it shows, and its first frame."""
 
     before: RigFilter
     evidence: RigEvidence
     first: int
-    unlikely: bool
 
 
 class SelfCalibration:
@@ -89,9 +87,9 @@ class SelfCalibration:
     _applied: Kept[FloatArray]
     steps: Kept[list[CalibrationStep]]
     windows: Kept[int]
-    knocks: Kept[int]
+    moved_at: Kept[list[int]]
     moved_before: Kept[bool]
-    _since: Kept[int]
+    suspected: Kept[int | None]
     _seen: Kept[int]
     _frames: Kept[list[tuple[FloatArray, Observations]]]
     _last_time: Kept[float | None]
@@ -119,12 +117,14 @@ class SelfCalibration:
         """How it became known, window by window."""
         self.windows = 0
         """How many gave evidence."""
-        self.knocks = 0
-        """How often the rig was found to have moved."""
+        self.moved_at: list[int] = []
+        """Frames with which the rig was found to have moved."""
         self.moved_before = False
         """Whether it was found to have moved since the drives that it began with."""
+        self.suspected = None
+        """Frame from which on the rig seems to be another one, while that is undecided."""
         self._applied = self.found.applied.values
-        self._since, self._seen = 0, 0
+        self._seen = 0
         self._sigma = pixel_sigma
         self._frames = []
         self._last_time = None
@@ -147,7 +147,24 @@ class SelfCalibration:
     @property
     def settled(self) -> SettledRig:
         """Since when the rig is as it is now, and what no term follows."""
-        return SettledRig(self.knocks, self._since, self.field_px)
+        return SettledRig(self.knocks, self.moved_at[-1] if self.moved_at else 0, self.field_px)
+
+    @property
+    def knocks(self) -> int:
+        """How often the rig was found to have moved."""
+        return len(self.moved_at)
+
+    @property
+    def moves(self) -> list[int]:
+        """Frames with which the rig has moved, or seems to have; several of a loose camera."""
+        return [*self.moved_at, *([] if self.suspected is None else [self.suspected])]
+
+    def remarks(self) -> tuple[Remark, ...]:
+        """That the rig has moved, or seems to have."""
+        if not (moves := self.moves):
+            return ()
+        code = "rig_loose" if len(moves) > 1 else "rig_moved" if self.moved_at else "rig_doubted"
+        return (Remark(code, tuple(moves)),)
 
     def shown(self) -> tuple[FloatArray, FloatArray]:
         """Information (n, n) and pull (n,) of the drive, without what it began with.
@@ -183,8 +200,8 @@ class SelfCalibration:
         if unlikely:  # linearised where the window itself would go
             other = before.without_terms(of)
             evidence = alignment.evidence(other.values(of), other.precision(of)) or evidence
-        window = _Window(before, evidence, self._seen - len(frames), unlikely)
-        self._recent = [*self._recent[-1 - _DECIDING :], window]
+        window = _Window(before, evidence, self._seen - len(frames))
+        self._recent = [*self._recent[1 - _RECENT :], window]
         self._known = judged.after(of, evidence)
         moved = self._moved_in()
         if moved is not None:
@@ -192,10 +209,9 @@ class SelfCalibration:
             if moved < 0:
                 self.moved_before = True
             else:
-                self.knocks += 1
-                self._since = windows[moved].first
-            self._known = windows[0].before.without_terms(of)
-            for one in windows[0 if moved < 0 else 2 :]:
+                self.moved_at = [*self.moved_at, windows[moved].first]
+            self._known = windows[max(moved, 0)].before.without_terms(of)
+            for one in windows[moved + 1 :]:  # it may have moved within one
                 self._known = self._known.judged(of, one.evidence)[1].after(of, one.evidence)
         self.found = self._held(self._known.weighed(of))
         self._applied = self.found.applied.values
@@ -203,24 +219,26 @@ class SelfCalibration:
         self.steps.append(CalibrationStep(timestamp, *known, self._applied, self.knocks))
 
     def _moved_in(self) -> int | None:
-        """In which of the two oldest recent windows the rig has moved; None: in neither.
+        """With which of the recent windows the rig has moved; None: with none, or undecided.
 
         Two rigs, before and after, then explain the windows far better than one, with the same
-        nuisances; better than if it had moved later; and they differ over the whole image. -1: the
-        first windows of the drive are of another rig than that which it began with.
+        nuisances; better than if it had moved at another one; and they differ over the whole
+        image. -1: the first windows of the drive are of another rig than it began with.
         """
         likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, self._unknowns.terms)
-        if self._known.remembered and len(self._recent) == self.windows:
-            move = self._moved(0)
-            if move.significance() > likely and move.rms_px() > _KNOCK_PX:
-                return -1
-        if len(self._recent) < 2 + _DECIDING or not any(one.unlikely for one in self._recent):
-            return None
         moves = [self._moved(k) for k in range(len(self._recent))]
-        sure = [move.significance() for move in moves]
-        first = int(np.argmax(sure))
-        knocked = first < 2 and sure[first] > likely and moves[first].rms_px() > _KNOCK_PX
-        return first if knocked else None
+        sure = [move.significance() * (move.rms_px() > _KNOCK_PX) for move in moves]
+        terms = slice(self._unknowns.terms)
+        sure[0] *= self._recent[0].before.information[terms, terms].any()  # else nothing was known
+        first, self.suspected = int(np.argmax(sure)), None
+        if sure[first] <= likely:
+            return None
+        if self._known.remembered and len(self._recent) == self.windows and sure[0] > likely:
+            return -1
+        if len(self._recent) - first >= _DECIDING:
+            return first
+        self.suspected = self._recent[first].first
+        return None
 
     def _moved(self, first: int) -> RigCorrection:
         """By how much the rig differs from a recent window on, if all before are of one rig."""
@@ -251,7 +269,7 @@ class SelfCalibration:
         """
         old = self._applied
         change = found.applied.values - old
-        undecided = any(one.unlikely for one in self._recent)
+        undecided = self.suspected is not None
         if undecided or change @ np.linalg.solve(found.applied.covariance, change) <= 1.0:
             return found.applying(old)
         return found

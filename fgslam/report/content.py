@@ -482,6 +482,12 @@ SENTENCES = {
     "{percent:.0f} % as many matches as the pose follows: something large passes. Without odometry "
     "the pose is uncertain where that fills more of the view than the scene, for it may follow "
     "what passes (leave these frames out: --start, --stop)",
+    "rig_doubted": "the cameras seem to have moved against each other at about frame {first} of "
+    "the run; too few frames have followed to decide it",
+    "rig_loose": "the cameras move against each other, {count} times from about frame {first} of "
+    "the run on: what is measured from there on may be wrong; fasten them and calibrate again",
+    "rig_moved": "the cameras moved against each other at about frame {first} of the run: "
+    "corrected from there on; fasten them and calibrate the rig again",
     "scene_repeats": "the scene repeats itself in {count} frames, {span}: images fit several "
     "places alike, the pose is by odometry",
     "unconnected": "{named}: located relative to each other only, not in the first map; before is "

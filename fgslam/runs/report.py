@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fgslam.backend.self_calibration import SelfCalibration
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.files import make_subfolder
@@ -137,14 +138,18 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
 _LEAST_IN_MAP = 2.0 / 3.0  # of the frames: a map of fewer is no map of the drive
 
 
-def located(recorder: RunRecorder, parts: MapParts) -> LocatedShare:
+def located(
+    recorder: RunRecorder, parts: MapParts, calibration: SelfCalibration | None = None
+) -> LocatedShare:
     """Frames that landmarks gave a pose in the map that is reported, that of the first frame.
 
-    Of all, with those before the first one.
+    Of all, with those before the first one. None is decided that a loose camera has seen.
     """
     all_of = recorder.left_out + len(recorder)
     status = recorder.column("status")
     undecided = int((status == EgoMotionStatus.CONTRADICTED.value).sum())
+    if calibration is not None and len(calibration.moves) > 1:
+        undecided = max(undecided, len(recorder) - calibration.moves[0])
     return LocatedShare(in_first_map(recorder, parts), all_of, _LEAST_IN_MAP, undecided)
 
 
@@ -153,8 +158,8 @@ def alarms(share: LocatedShare | None, landmarks: object) -> tuple[str, ...]:
     found = ["No success: there is no map, not one landmark was kept."] if landmarks == 0 else []
     if share is not None and not share.decided:
         found.append(
-            f"No success: images and odometry contradict each other in {share.undecided} frames, "
-            "and nothing in view shows which errs."
+            f"No success: {share.undecided} frames are undecided, as images contradict odometry "
+            "or, by a loose camera, each other, and nothing in view shows which errs."
         )
     elif share is not None and not share.enough:
         found.append(

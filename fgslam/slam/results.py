@@ -471,6 +471,7 @@ def session_remarks(
         *(() if watch is None else watch.remarks()),
         *_image_remarks(recorder, seen or FirstImages()),
         *pipeline.witnesses.remarks(),
+        *(() if pipeline.calibration is None else pipeline.calibration.remarks()),
         *pipeline.tracker.other_motion.remarks(),
     )
 

@@ -450,8 +450,7 @@ def calibration_note(calibration: SelfCalibration | None, knocked: bool = False)
     """
     if calibration is None or not calibration.windows:
         return ""
-    found, field = calibration.found, calibration.field_px
-    more = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
+    found, field, more = calibration.found, calibration.field_px, ""
     # What no term of a correction follows, where that is more than usual.
     if field >= _LEAST_FIELD_PX:
         more += (
@@ -536,7 +535,7 @@ class RunOutputs:
     @property
     def located(self) -> LocatedShare:
         """Frames located in the map."""
-        return located(self.recorder, self.pipeline.tracker.parts)
+        return located(self.recorder, self.pipeline.tracker.parts, self.pipeline.calibration)
 
     @property
     def title(self) -> str:

@@ -402,9 +402,25 @@ def test_a_knock_in_mid_drive_is_noticed_and_followed(seed: int) -> None:
         if itself.knocks and noticed < 0:
             noticed = k + 1 - at
     assert itself.knocks == 1
-    assert 0 < noticed <= 6 * WINDOW  # what is left of its own, four that decide, and one more
+    assert 0 < noticed <= 4 * WINDOW  # what is left of its own, two that decide, and one more
+    assert [(one.code, len(one.frames)) for one in itself.remarks()] == [("rig_moved", 1)]
     before_it = image_error(RigCorrection.none(RIG), knocked)
     assert image_error(itself.found.applied, knocked) < 0.1 * before_it
+
+
+def test_a_loose_camera_is_named_and_a_knock_of_the_first_frames_is_found() -> None:
+    """To one side with the second window, and back two windows later."""
+    road, itself = Road(frames=42), SelfCalibration(RIG, SIGMA_PX)
+    turned = errors(yaw=np.deg2rad(0.25))
+    straight, aside = (drive(road, by, np.random.default_rng(3)) for by in (errors(), turned))
+    seems = []
+    for k, wTc in enumerate(poses_of(road)):
+        itself.observe((aside if WINDOW <= k < 4 * WINDOW else straight)[k], wTc)
+        seems.append([one.code for one in itself.remarks()])
+    assert seems[2 * WINDOW - 1] == ["rig_doubted"]
+    assert seems[3 * WINDOW - 1] == ["rig_moved"]
+    assert seems[-1] == ["rig_loose"]
+    assert itself.moved_at == [WINDOW, 4 * WINDOW]
 
 
 def test_a_state_taken_within_a_window_goes_on_with_the_same_bits() -> None:

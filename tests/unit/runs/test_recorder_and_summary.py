@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -262,6 +263,16 @@ def test_frames_beyond_the_map_that_is_reported_are_no_success(
     assert (share.frames, share.of, share.enough) == (connected, 51, enough)
     assert bool(alarms(share, landmarks=900)) is not enough
     assert all("No success: 33 of 51 frames" in one for one in alarms(share, landmarks=900))
+
+
+@pytest.mark.parametrize(("moves", "enough"), [([], True), ([20], True), ([20, 40], False)])
+def test_what_a_loose_camera_has_seen_is_no_success(moves: list[int], enough: bool) -> None:
+    share = located(recorder_of(51), Apart([True] * 51), SimpleNamespace(moves=moves))
+    assert share.enough is enough
+    said = alarms(share, landmarks=900)
+    assert [("31 frames are undecided" in one, "loose camera" in one) for one in said] == [
+        (True, True)
+    ] * (not enough)
 
 
 def test_without_a_map_the_headline_says_so() -> None:
