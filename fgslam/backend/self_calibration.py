@@ -175,12 +175,19 @@ class SelfCalibration:
         information = self._known.information - left * self._begun.information
         return information, self._known.pull - left * self._begun.pull
 
-    def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
-        """Takes in a frame as measured and its pose; returns the correction as known now."""
-        if increment.relocalised:
-            self._frames.clear()
-        self._frames.append((wTc, increment.kept))
+    def observe(
+        self, increment: Increment, wTc: FloatArray, passes: bool = False
+    ) -> WeighedCorrection:
+        """Takes in a frame as measured and its pose; returns the correction as known now.
+
+        ``passes``: something that moves is in view; the frame is no evidence.
+        """
         self._seen += 1
+        if increment.relocalised or passes:
+            self._frames.clear()
+        if passes:
+            return self.found
+        self._frames.append((wTc, increment.kept))
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []
             self._take(frames, increment.timestamp)

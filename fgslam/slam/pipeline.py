@@ -363,8 +363,10 @@ class SlamPipeline:
 
     @timed("calibrate")
     def _calibrate(self, increment: Increment, stats: UpdateStats) -> None:
+        found = self.witnesses.found[-1:]  # what passes is no evidence of the rig
+        passes = any(f.number == increment.index and f.verdict == "odometry" for f in found)
         if self.calibration is not None:
-            self.calibration.observe(increment, stats.wTc)
+            self.calibration.observe(increment, stats.wTc, passes)
 
     def _correction(self) -> RigCorrection | None:
         return None if self.calibration is None else self.calibration.found.applied
