@@ -162,23 +162,23 @@ class Fusion:
         if not (weight >= kept_sigma_m**-2).any():
             return Surface.empty()
         mesh = self._grid.extract_triangle_mesh(kept_sigma_m**-2)
-        vertices = mesh.vertex.positions.numpy()
-        # Open3D's order changes from call to call.
-        order = np.lexsort(vertices.T)
-        place = np.empty(len(order), np.int32)
-        place[order] = np.arange(len(order), dtype=np.int32)
-        triangles = place[mesh.triangle.indices.numpy()]
+        columns = [mesh.vertex[name].numpy() for name in ("positions", "normals", "colors")]
+        # Open3D's order changes from call to call, and which of two equal vertices it takes.
+        rows, place = np.unique(np.nan_to_num(np.hstack(columns)), axis=0, return_inverse=True)
+        vertices, normals, colours = rows[:, :3], rows[:, 3:6], rows[:, 6:]
+        triangles = place.ravel().astype(np.int32)[mesh.triangle.indices.numpy()]
+        triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
         first = triangles.argmin(axis=1)[:, None]
         triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
-        nearest = np.rint(vertices[order] / self.voxel_m).astype(np.int64)
+        nearest = np.rint(vertices / self.voxel_m).astype(np.int64)
         block = np.floor_divide(nearest, _SIDE)
         x, y, z = (nearest - _SIDE * block).T
         at = self._rows(block) * _SIDE**3 + x + _SIDE * (y + _SIDE * z)
         return Surface(
-            vertices[order],
+            np.ascontiguousarray(vertices),
             triangles[np.lexsort(triangles.T)],
-            mesh.vertex.normals.numpy()[order],
-            np.rint(255.0 * mesh.vertex.colors.numpy()[order]).clip(0, 255).astype(np.uint8),
+            np.ascontiguousarray(normals),
+            np.rint(255.0 * colours).clip(0, 255).astype(np.uint8),
             np.sqrt(1.0 / weight[at, 0]),
             np.sqrt(self._array("shared")[at, 0]),
         )
