@@ -20,7 +20,7 @@ from fgslam.evaluation.statistics import associate, rotation_angles
 _FEWEST = 10  # poses: the median of fewer steps is no measure
 _FAR = 4.0  # the median length of three normal numbers is 1.54 sigma: six sigma
 _LONGEST_START = 0.25  # of the poses: more is no start that contradicts a rest
-_ALONE = 2.0  # times the largest error over as many steps anywhere else
+_ALONE = 2.0  # times the largest error over as many steps elsewhere; of jerks, times the path's
 _STILL = 1e-6  # radians and metres: no error at all
 
 
@@ -69,7 +69,7 @@ def sound_truth(path: Trajectory, truth: Trajectory | None) -> SoundTruth:
 
 def unsound_start(estimate: FloatArray, truth: FloatArray) -> int:
     """How many of the first poses contradict the rest; (n, 4, 4) of the same instants."""
-    wide = _wide(_differences(estimate, truth, 1))
+    wide = _wide(_differences(estimate, truth, 1)).any(axis=1)
     settled = ~wide[:-1] & ~wide[1:]
     count = int(np.argmax(settled)) if settled.any() else len(wide)
     if not 0 < count <= _LONGEST_START * len(estimate):
@@ -80,11 +80,16 @@ def unsound_start(estimate: FloatArray, truth: FloatArray) -> int:
 
 
 def unsound_singles(estimate: FloatArray, truth: FloatArray) -> IntArray:
-    """Poses (k,) from which both steps err, the step over them does not, and the truth is jerky."""
+    """Poses (k,) from which both steps err, the step over them does not, and the truth jerks.
+
+    By far more than it does elsewhere, and than the path does there: a rough drive jerks, too, and
+    an error of the path makes its own jerk now larger, now smaller than the truth's.
+    """
     wide = _wide(_differences(estimate, truth, 1))
-    over = ~_wide(_differences(estimate, truth, 2))
-    jerky = (_bends(truth) > _bends(estimate)).any(axis=1)
-    return np.flatnonzero(wide[:-1] & wide[1:] & over & jerky) + 1
+    over = ~_wide(_differences(estimate, truth, 2)).any(axis=1)
+    jerks = _bends(truth)
+    jerky = _wide(jerks) & (jerks > _ALONE * _bends(estimate))
+    return np.flatnonzero((wide[:-1] & wide[1:] & jerky).any(axis=1) & over) + 1
 
 
 def _differences(estimate: FloatArray, truth: FloatArray, lag: int) -> FloatArray:
@@ -114,9 +119,8 @@ def _sizes(motions: FloatArray) -> FloatArray:
 
 
 def _wide(differences: FloatArray) -> BoolArray:
-    """(n,) which are far larger than most, in angle or in distance."""
-    usual = np.maximum(np.median(differences, axis=0), _STILL)
-    return np.asarray((differences > _FAR * usual).any(axis=1))
+    """(n, 2) which are far larger than most, in angle and in distance."""
+    return np.asarray(differences > _FAR * np.maximum(np.median(differences, axis=0), _STILL))
 
 
 def _size(off: FloatArray) -> str:

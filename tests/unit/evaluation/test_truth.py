@@ -73,6 +73,20 @@ def test_an_estimate_that_jumps_is_not_excused() -> None:
     assert not len(sound_truth(path(errors), drifting(2)).left_out)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_an_estimate_that_jumps_where_the_drive_is_rough_is_not_excused(seed: int) -> None:
+    """There the path's own jerk is as often the smaller one."""
+    rng = np.random.default_rng(seed)
+    rough = path(np.repeat([0.02, 0.1], 3) * rng.normal(size=(COUNT - 1, 6)))
+    poses = rough.poses.copy()
+    small = 1e-3 * rng.normal(size=(COUNT, 6))
+    small[[20, 30, 40]] *= 30.0
+    for k in range(COUNT):
+        poses[k] = poses[k] @ se3_exp(small[k])
+    found = sound_truth(Trajectory(rough.timestamps, poses), rough)
+    assert not len(found.left_out)
+
+
 def test_a_start_that_errs_no_more_than_elsewhere_is_kept() -> None:
     errors = np.zeros((COUNT - 1, 6))
     errors[[0, 1, 40, 41], 1] = 0.01
