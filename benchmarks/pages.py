@@ -11,6 +11,7 @@ from benchmarks.rows import RESULTS, Record, Row, Section, load_record, shown_bo
 from benchmarks.tables import Cell, Table, grid, shown
 
 PAGES = Path(__file__).parents[1] / "docs" / "results"
+README = Path(__file__).parents[1] / "README.md"
 WIDTH = 118
 _NOTE = "<!-- Made by `python -m benchmarks pages` from benchmarks/results/{}.json: edit that. -->"
 _BY_HAND = "by hand"
@@ -32,10 +33,11 @@ SUBJECTS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 def write_pages(results: Path = RESULTS, folder: Path = PAGES) -> None:
-    """Writes one page a subject, and the overview."""
+    """Writes one page a subject, the overview, and the numbers in README."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in all_pages(results).items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
+    README.write_text(readme(README.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def all_pages(results: Path = RESULTS) -> dict[str, str]:
@@ -46,6 +48,54 @@ def all_pages(results: Path = RESULTS) -> dict[str, str]:
     }
     pages = {name: page(SUBJECTS[name][0], found) for name, found in records.items()}
     return pages | {"index": overview(records)}
+
+
+def readme(text: str) -> str:
+    """README with the tables between its marks made anew from what is stored."""
+    before, rest = text.split(_BEGIN)
+    after = rest.split(_END)[1]
+    peers, lab = stored("peers"), stored("lab_loop").numbers["estimators"]
+    lines = grid(_BESIDE, _of_peers(peers.numbers["Beside other programs"]))
+    told = "; ".join(_of_lab(lab))
+    lines += ["", *_wrapped(f"The paper's drive, rendered, 249 frames, ATE and NEES: {told}.")]
+    return f"{before}{_BEGIN}\n\n" + "\n".join(lines) + f"\n\n{_END}{after}"
+
+
+_BEGIN = "<!-- numbers: `python -m benchmarks pages` makes them -->"
+_END = "<!-- end of numbers -->"
+_BESIDE = (
+    "no odometry, SE(3) aligned", "fgslam: live, end", "NEES", "ORB-SLAM3: live, end",
+    "CPU of the command / ORB-SLAM3's",
+)  # fmt: skip
+
+
+def _of_lab(estimators: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    for name, values in estimators.items():
+        ate, nees = 100.0 * values["ate_rmse_m"], values.get("nees_pose_per_dof")
+        yield f"{name} {shown(ate)} cm, {shown(nees)}"
+
+
+def _of_peers(columns: Mapping[str, Sequence[Cell]]) -> Iterator[tuple[str, ...]]:
+    """A line for each recording as it is: fgslam's default beside ORB-SLAM3."""
+    rows = {
+        (str(recording), str(program)): {name: columns[name][k] for name in columns}
+        for k, (recording, program) in enumerate(
+            zip(columns["recording"], columns["program"], strict=True)
+        )
+    }
+    for (recording, program), ours in rows.items():
+        theirs = rows.get((recording, "ORB-SLAM3"))
+        if program != "fgslam" or "," in recording or theirs is None:
+            continue
+        yield (
+            f"`{recording}`", _both(ours), shown(ours["NEES"]), _both(theirs),
+            shown(ours["CPU / ORB-SLAM3's"]),
+        )  # fmt: skip
+
+
+def _both(row: Mapping[str, Cell]) -> str:
+    live, end = row["ATE live"], row["ATE end"]
+    return "lost" if live is None else f"{shown(live)}, {shown(end)} m ({row['located']})"
 
 
 def overview(records: Mapping[str, Sequence[Record]]) -> str:

@@ -22,6 +22,7 @@ from benchmarks.evidence import peer
 from benchmarks.evidence.vocabulary import train_vocabulary
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.arrays import Image
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
@@ -63,6 +64,7 @@ class Outcome:
         live: ATE of the poses given at each frame (m, SE(3) aligned).
         end: of the last estimate; NaN where the program has none.
         located: frames with a pose.
+        nees: of the last poses, a degree of freedom; NaN where no covariance is stated.
         scale: of the estimate against the truth.
         cpu_s: of the whole process; loop_s: from image to pose.
         memory_mb: the largest that it held.
@@ -70,6 +72,7 @@ class Outcome:
 
     live: float
     end: float
+    nees: float
     located: int
     scale: float
     cpu_s: float
@@ -100,8 +103,8 @@ def tables(data: Path, only: Path | None = None) -> Iterator[Table]:
 
 
 _COLUMNS = (
-    "ATE live", "ATE end", "located", "scale", "CPU", "CPU of the loop", "CPU / ORB-SLAM3's",
-    "memory",
+    "ATE live", "ATE end", "NEES", "located", "scale", "CPU", "CPU of the loop",
+    "CPU / ORB-SLAM3's", "memory",
 )  # fmt: skip
 
 
@@ -166,8 +169,8 @@ def _rows(course: Course, programs: dict[str, Program], folder: Path) -> Iterato
     for name, one in found.items():
         located = f"{one.located} of {count}"
         yield (
-            course.name, name, one.live, one.end, located, one.scale, one.cpu_s, one.loop_s,
-            one.cpu_s / base, round(one.memory_mb),
+            course.name, name, one.live, one.end, one.nees, located, one.scale, one.cpu_s,
+            one.loop_s, one.cpu_s / base, round(one.memory_mb),
         )  # fmt: skip
 
 
@@ -220,16 +223,17 @@ def _fgslam(estimator: str) -> Program:
         out = folder / "run"
         cpu = _spent([
             "-m", "fgslam", "run", str(folder), "--estimator", estimator, *_ALONE,
-            "--out", str(out), "--overwrite",
+            "--rig-memory", "off", "--out", str(out), "--overwrite",
         ])  # fmt: skip
         metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
         located = metrics["located"]["frames"]
         title = next(iter(metrics["estimators"]))
-        memory = metrics["estimators"][title]["peak_memory_mb"]
+        own = metrics["estimators"][title]
+        nees, memory = own["nees_pose_per_dof"] or np.nan, own["peak_memory_mb"]
         live, _ = _error(out / title / "online.tum", truth)
         end, scale = _error(out / title / "final.tum", truth)
         _spent(["-m", "benchmarks.evidence.peer", estimator, str(folder)])
-        return Outcome(live, end, located, scale, cpu, _loop(folder)["loop_s"], memory)
+        return Outcome(live, end, nees, located, scale, cpu, _loop(folder)["loop_s"], memory)
 
     return run
 
@@ -242,13 +246,16 @@ def _other(method: str) -> Program:
         end = np.nan
         if method == "orb_slam3":
             end, scale = _error(folder / "end.tum", truth)
-        return Outcome(live, end, told["located"], scale, cpu, told["loop_s"], told["memory_mb"])
+        return Outcome(
+            live, end, np.nan, told["located"], scale, cpu, told["loop_s"], told["memory_mb"]
+        )
 
     return run
 
 
 PROGRAMS: dict[str, Program] = {
-    "fgslam": _fgslam("isam2"),
+    "fgslam": _fgslam(DEFAULT_ESTIMATOR),
+    "fgslam, iSAM2": _fgslam("isam2"),
     "fgslam, Kalman": _fgslam("landmark_kalman"),
     "ORB-SLAM3": _other("orb_slam3"),
     "SIFT and PnP": _other("sift_pnp"),

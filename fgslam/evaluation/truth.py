@@ -69,7 +69,7 @@ def sound_truth(path: Trajectory, truth: Trajectory | None) -> SoundTruth:
 
 def unsound_start(estimate: FloatArray, truth: FloatArray) -> int:
     """How many of the first poses contradict the rest; (n, 4, 4) of the same instants."""
-    wide = _wide(_differences(estimate, truth, 1)).any(axis=1)
+    wide: BoolArray = np.asarray(_wide(_differences(estimate, truth, 1)).any(axis=1))
     settled = ~wide[:-1] & ~wide[1:]
     count = int(np.argmax(settled)) if settled.any() else len(wide)
     if not 0 < count <= _LONGEST_START * len(estimate):
@@ -89,7 +89,8 @@ def unsound_singles(estimate: FloatArray, truth: FloatArray) -> IntArray:
     over = ~_wide(_differences(estimate, truth, 2)).any(axis=1)
     jerks = _bends(truth)
     jerky = _wide(jerks) & (jerks > _ALONE * _bends(estimate))
-    return np.flatnonzero((wide[:-1] & wide[1:] & jerky).any(axis=1) & over) + 1
+    alone = np.any(wide[:-1] & wide[1:] & jerky, axis=1) & over
+    return np.flatnonzero(alone) + 1
 
 
 def _differences(estimate: FloatArray, truth: FloatArray, lag: int) -> FloatArray:
