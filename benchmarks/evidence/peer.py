@@ -101,7 +101,11 @@ def _orb_slam3(
 
     out = _drive(step, shots, _MAPPING_S)
     slam.shutdown()
-    slam.save_trajectory_tum(str(folder / "end.tum"))
+    end = folder / "end.tum"
+    slam.save_trajectory_tum(str(end))
+    # It writes frames of several maps one after the other, some of them twice: the last counts.
+    lines = {float(line.split()[0]): line for line in end.read_text().splitlines()}
+    end.write_text("".join(f"{lines[t]}\n" for t in sorted(lines)), encoding="utf-8")
     return out
 
 

@@ -105,20 +105,21 @@ class SlamPipeline:
         before = self._before()
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
-        around = self.witnesses.widened(prediction)
+        step = self.witnesses.widened(odometry)
+        around = prediction if step is odometry else predicted(self.estimator, step)
         carried = self._track_patches(around, frame, landmarks)  # between key frames
         frame = self._check_cameras(frame, index, body, carried)  # late, frozen, swapped: not used
         if frame.refused and self.key_frames is not None:
             put_back(*before[-1])
             carried = None
         if self.key_frames and carried and self._needs_no_features(carried, odometry, prediction):
-            stereo, features = carried.carried.features, None
+            stereo, features, odometry = carried.carried.features, None, step
             matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
         else:
             frame = self._find_features(frame, carried, before)  # 2.1
             every = self._match_stereo(frame)  # 2.2
             every, matched = self._track(
-                Frame(index, odometry, prediction, landmarks, every), frame, carried
+                Frame(index, odometry, prediction, landmarks, every), frame, carried, step, around
             )
             odometry = matched.odometry
             stereo = features = every.whole
@@ -241,17 +242,24 @@ class SlamPipeline:
 
     @timed("track")
     def _track(
-        self, now: Frame, frame: FeatureFrame, carried: CarriedFrame | None
+        self,
+        now: Frame,
+        frame: FeatureFrame,
+        carried: CarriedFrame | None,
+        step: Odometry | None,
+        prediction: Prediction,
     ) -> tuple[StereoFeatures, Matched]:
-        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
-        prediction, landmarks = self.witnesses.widened(now.prediction), now.landmarks
-        stereo = now.features
+        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3).
+
+        Looked for around the prediction of ``step``, the odometry as uncertain as it errs.
+        """
+        landmarks, stereo = now.landmarks, now.features
         if frame.frame is None or frame.frame.alone is not None:
             if by_one := self._track_alone(now, frame):
                 return stereo, by_one
             status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
             blind = self.tracker.track_blind(prediction, status)
-            return stereo, Matched(blind, Association.nothing(), now.odometry)
+            return stereo, Matched(blind, Association.nothing(), step)
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:

@@ -117,15 +117,15 @@ class Witnesses:
             return True
         return self._squared(step, prediction, tracking) > _GATE
 
-    def widened(self, prediction: Prediction) -> Prediction:
-        """The prediction, as uncertain as odometry errs while images are decided to be right.
+    def widened(self, odometry: Odometry | None) -> Odometry | None:
+        """Odometry, as uncertain as it errs while images are decided to be right.
 
         Else it would pull a frame of few matches along, which then seems to agree.
         """
-        if self._other is None or self.score[-1] >= -_DECIDED:
-            return prediction
+        if odometry is None or self._other is None or self.score[-1] >= -_DECIDED:
+            return odometry
         errs = np.outer(self._erred, self._erred)
-        return Prediction(prediction.wTc, prediction.covariance + errs)
+        return replace(odometry, covariance=odometry.covariance + errs)
 
     def judge(self, frame: Frame, tracked: Tracked) -> Judged:
         """The frame as it is to be taken in.
@@ -140,7 +140,7 @@ class Witnesses:
         self._judged = True
         body = self._body_in(frame.features)
         tracked = _beginning_none(tracked, body)
-        agreed = Judged(tracked, "agreed", frame.odometry)
+        agreed = Judged(tracked, "agreed", self.widened(frame.odometry))
         found, here = tracked.ego_motion, self._other
         # What was cut off its correction is the contradiction.
         free = found.status is EgoMotionStatus.CAPPED

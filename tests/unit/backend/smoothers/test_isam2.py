@@ -242,8 +242,8 @@ def test_landmarks_behind_a_camera_are_put_back_before_it() -> None:
 class Mute(Failing):
     """A solver that is updated, but cannot tell a covariance."""
 
-    def update(self, *arguments: Any) -> None:
-        self._solver.update(*arguments)
+    def update(self, *arguments: Any) -> Any:
+        return self._solver.update(*arguments)
 
     def marginalCovariance(self, key: int) -> None:
         raise RuntimeError(FAILED.format(key=key))
