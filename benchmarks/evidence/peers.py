@@ -206,7 +206,10 @@ def _write_images(course: Course, folder: Path) -> tuple[Trajectory, int]:
     (folder / "calib.json").write_text(json.dumps(calibration), encoding="utf-8")
     lines = [f"{k:06d} {t:.9f}\n" for k, t in enumerate(times)]
     (folder / "times.txt").write_text("".join(lines), encoding="utf-8")
-    return truth.of("left", rig), len(times)
+    left = truth.of("left", rig)
+    left.save(folder / "truth.tum")
+    (folder / "truth.tum").rename(folder / "gt_left_cam.txt")
+    return left, len(times)
 
 
 def _grey(image: Image) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import benchmarks.__main__ as runner
 from benchmarks.__main__ import EVIDENCE
 from benchmarks.measured import keep, stored
-from benchmarks.pages import PAGES, SUBJECTS, WIDTH, all_pages, fitted, page
+from benchmarks.pages import PAGES, README, SUBJECTS, WIDTH, all_pages, fitted, page, readme
 from benchmarks.rows import (
     RESULTS,
     RecordError,
@@ -113,6 +114,15 @@ def test_pages_of_results_are_those_of_the_committed_measurements() -> None:
         name for _, names in SUBJECTS.values() for name in names
     }
     assert {path.stem for path in PAGES.glob("*.md")} == set(all_pages())
+
+
+def test_numbers_in_readme_are_those_of_the_stored_measurements() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert readme(text) == text, "stale numbers in README: run python -m benchmarks pages"
+    kept = text.split("<!-- numbers:")[1].split("<!-- end of numbers -->")[0]
+    assert "ORB-SLAM3" in kept
+    others = re.findall(r"\d+[.,]?\d* (?:cm|mm|%)|NEES \d", text.replace(kept, ""))
+    assert not others, "numbers of accuracy beside the table"
 
 
 def test_lines_of_result_pages_fit() -> None:
