@@ -62,15 +62,17 @@ class Course:
     change: Change | None = None
 
 
-def _noisy(image: Image, rng: np.random.Generator) -> Image:
-    return _grey_levels(image + _NOISE_LEVELS * rng.normal(size=image.shape))
+def noisy(levels: float) -> Change:
+    """Adds noise of that deviation."""
+    return lambda image, rng: _grey_levels(image + levels * rng.normal(size=image.shape))
 
 
 def _dark(image: Image, rng: np.random.Generator) -> Image:
     return _grey_levels(_DARK * image + _DARK_LEVELS * rng.normal(size=image.shape))
 
 
-def _blurred(image: Image, rng: np.random.Generator) -> Image:
+def blurred(image: Image, rng: np.random.Generator) -> Image:
+    """By two pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR_PX), np.uint8)
 
 
@@ -82,8 +84,8 @@ COURSES = (
     Course("`kitti06`", "kitti06"),
     Course("every second frame", "kitti06", slice(None, None, 2)),
     Course("every third", "kitti06", slice(None, None, 3)),
-    Course("blurred (2 px)", "kitti06", change=_blurred),
-    Course("noise of 8 grey levels", "kitti06", change=_noisy),
+    Course("blurred (2 px)", "kitti06", change=blurred),
+    Course("noise of 8 grey levels", "kitti06", change=noisy(_NOISE_LEVELS)),
     Course("a twelfth as bright", "kitti06", change=_dark),
     Course("`kitti_raw_0926`", "kitti_raw_0926_5hz"),
     Course("its frames 0-100", "kitti_raw_0926_5hz", slice(0, 100)),
@@ -175,9 +177,10 @@ def _raw_seconds(shots: Shots) -> float:
     some = shots[::_RAW_EVERY]
     for _, images in some:
         for image in images:
-            alone.detectAndCompute(_grey(image), None)
+            alone.detectAndCompute(grey_of(image), None)
     return (time.process_time() - start) / len(some)
 
 
-def _grey(image: Image) -> Image:
+def grey_of(image: Image) -> Image:
+    """An image without colour."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))

@@ -10,21 +10,24 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 
 import fgslam as fg
-from benchmarks.evidence import peer
+from benchmarks.evidence import front_ends, peer
+from benchmarks.evidence.front_ends import Change, blurred, grey_of, noisy
 from benchmarks.evidence.vocabulary import train_vocabulary
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
 from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.arrays import Image
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.types import Trajectory
+from fgslam.datasets.folders import TRUTH_LEFT, write_image_folder, write_poses
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 RECORDINGS = (
@@ -34,24 +37,16 @@ RECORDINGS = (
 RAW, SPOILT = "kitti_raw_0926_5hz", ("kitti06", "euroc_v101_kf100")
 PIECES, PIECE = tuple(range(0, 200, 40)), 40
 """First frames of the pieces of :data:`RAW`, and how many each has."""
-SIDES = ("left", "right")
 _TURNS = 2
 EXIT_OF_FAULTS = 3
 """What `fgslam run` ends with where measurements contradict each other."""
 _ALONE = ("--set", "odometry.kind=constant_velocity")
 
 
-Change: TypeAlias = Callable[[Image, np.random.Generator], Image]
-
-
 @dataclass(frozen=True)
-class Course:
-    """A recording, which of its frames, and what is done to their images."""
+class Course(front_ends.Course):
+    """The same with frames that are left out, and images that are made smaller."""
 
-    name: str
-    folder: Path
-    frames: slice = field(default_factory=lambda: slice(None))
-    change: Change | None = None
     gap: range = range(0)
     scale: float = 1.0
 
@@ -90,7 +85,7 @@ def tables(data: Path, only: Path | None = None) -> Iterator[Table]:
     else:
         os.environ[peer.VOCABULARY] = str(vocabulary)
     rows: list[tuple[Cell, ...]] = []
-    for course in [Course(only.name, only)] if only else list(_courses(data)):
+    for course in [Course(only.name, str(only))] if only else list(_courses(data)):
         with tempfile.TemporaryDirectory() as folder:
             rows += _rows(course, programs, Path(folder))
     columns = ("recording", "program", *_COLUMNS)
@@ -111,17 +106,17 @@ _COLUMNS = (
 def _courses(data: Path) -> Iterator[Course]:
     for name in RECORDINGS:
         if (data / name).is_dir():
-            yield Course(name, data / name)
+            yield Course(name, str(data / name))
     if (data / RAW).is_dir():
         for first in PIECES:
             frames = slice(first, first + PIECE)
-            yield Course(f"{RAW}, frames {first}-{first + PIECE - 1}", data / RAW, frames)
+            yield Course(f"{RAW}, frames {first}-{first + PIECE - 1}", str(data / RAW), frames)
     for name in SPOILT:
         if (data / name).is_dir():
-            yield from _spoilt(name, data / name)
+            yield from _spoilt(name, str(data / name))
 
 
-def _spoilt(name: str, folder: Path) -> Iterator[Course]:
+def _spoilt(name: str, folder: str) -> Iterator[Course]:
     """The same drive with its images made worse, or with fewer of them."""
     for stride, nth in ((2, "second"), (3, "third")):
         yield Course(f"{name}, each {nth} frame", folder, slice(None, None, stride))
@@ -135,24 +130,16 @@ def _brightness(image: Image, rng: np.random.Generator) -> Image:
     return np.asarray(np.clip(image * rng.uniform(0.5, 1.5), 0, 255), np.uint8)
 
 
-def _blurred(image: Image, rng: np.random.Generator) -> Image:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 2.0), np.uint8)
-
-
 def _compressed(image: Image, rng: np.random.Generator) -> Image:
     _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def _noisy(image: Image, rng: np.random.Generator) -> Image:
-    return np.clip(np.rint(image + 10.0 * rng.normal(size=image.shape)), 0, 255).astype(np.uint8)
-
-
 CHANGES: dict[str, Change] = {
     "brightness jumps": _brightness,
-    "blur of 2 px": _blurred,
+    "blur of 2 px": blurred,
     "JPEG at 40": _compressed,
-    "noise of 10 grey levels": _noisy,
+    "noise of 10 grey levels": noisy(10.0),
 }
 
 
@@ -176,44 +163,34 @@ def _rows(course: Course, programs: dict[str, Program], folder: Path) -> Iterato
 
 def _write_images(course: Course, folder: Path) -> tuple[Trajectory, int]:
     """Rectified grey pairs, a recording that every program reads; the truth of the left camera."""
-    recording = fg.open_recording(str(course.folder))
+    recording = fg.open_recording(course.folder)
     rig, truth = recording.rig, recording.ground_truth
     if truth is None:
         raise fg.DatasetError(f"{course.folder}: no truth to judge programs by")
-    rng, size = np.random.default_rng(7), (1, 1)
-    times: list[float] = []
-    for side in SIDES:
-        (folder / side).mkdir()
-    frames = course.frames
-    for k, (t, images, _) in enumerate(
-        itertools.islice(recording, frames.start, frames.stop, frames.step)
-    ):
-        if images is None or k in course.gap:
-            continue
-        for side, image in zip(SIDES, images, strict=False):
-            grey = _grey(image)
-            size = (round(course.scale * grey.shape[1]), round(course.scale * grey.shape[0]))
-            grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-            grey = grey if course.change is None else course.change(grey, rng)
-            cv2.imwrite(str(folder / side / f"{len(times):06d}.png"), grey)
-        times.append(t)
+    rng, scale = np.random.default_rng(7), course.scale
+    size = (round(scale * rig.width), round(scale * rig.height))
     sx, sy = size[0] / rig.width, size[1] / rig.height
-    calibration = {
-        "width": size[0], "height": size[1], "fx": sx * rig.fx, "fy": sy * rig.fy,
-        "cx": sx * (rig.cx + 0.5) - 0.5, "cy": sy * (rig.cy + 0.5) - 0.5,
-        "baseline_m": rig.baseline, "rectified": True,
-    }  # fmt: skip
-    (folder / "calib.json").write_text(json.dumps(calibration), encoding="utf-8")
-    lines = [f"{k:06d} {t:.9f}\n" for k, t in enumerate(times)]
-    (folder / "times.txt").write_text("".join(lines), encoding="utf-8")
+    smaller = replace(
+        rig, width=size[0], height=size[1], fx=sx * rig.fx, fy=sy * rig.fy,
+        cx=sx * (rig.cx + 0.5) - 0.5, cy=sy * (rig.cy + 0.5) - 0.5, vertical_baseline=None,
+        bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    )  # fmt: skip
+
+    def shown(image: Image) -> Image:
+        grey = np.asarray(cv2.resize(grey_of(image), size, interpolation=cv2.INTER_AREA), np.uint8)
+        return grey if course.change is None else course.change(grey, rng)
+
+    frames = course.frames
+    chosen = enumerate(itertools.islice(recording, frames.start, frames.stop, frames.step))
+    shots = [
+        (t, [shown(image) for image in images[:2]][::-1])  # left is seen first, right is written so
+        for k, (t, images, _) in chosen
+        if images is not None and k not in course.gap
+    ]
+    write_image_folder(folder, smaller, shots)
     left = truth.of("left", rig)
-    left.save(folder / "truth.tum")
-    (folder / "truth.tum").rename(folder / "gt_left_cam.txt")
-    return left, len(times)
-
-
-def _grey(image: Image) -> Image:
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    write_poses(folder / TRUTH_LEFT, left)
+    return left, len(shots)
 
 
 Program = Callable[[Path, Trajectory], Outcome]

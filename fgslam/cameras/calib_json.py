@@ -261,6 +261,17 @@ def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) 
     return out
 
 
+def rectified_values(rig: CameraRig) -> dict[str, Any]:
+    """Keys and values of a ``calib.json`` of rectified cameras."""
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    values: dict[str, Any] = {name: getattr(rig, name) for name in names}
+    values["baseline_m"] = rig.baseline
+    if rig.vertical_baseline is not None:
+        values["vertical_baseline_m"] = rig.vertical_baseline
+    values["bTc"] = rig.bTc.tolist()
+    return values
+
+
 def write_corrected(
     path: Path, correction: RigCorrection, rectifier: Rectifier | None = None
 ) -> None:
@@ -280,12 +291,7 @@ def write_corrected(
         found = found + rectifier.correction
     raw = None if rectifier is None else rectifier.calibration
     if rectifier is None or raw is None:
-        names = ("width", "height", "fx", "fy", "cx", "cy")
-        values: dict[str, Any] = {name: getattr(rig, name) for name in names}
-        values["baseline_m"] = rig.baseline
-        if rig.vertical_baseline is not None:
-            values["vertical_baseline_m"] = rig.vertical_baseline
-        values["bTc"] = rig.bTc.tolist()
+        values = rectified_values(rig)
     else:
         motion = rig.bTc @ inverse(rectifier.rig.bTc)  # mounted otherwise on the robot
         if not np.allclose(motion, np.eye(4), rtol=0.0, atol=1e-12):

@@ -5,17 +5,27 @@ docs/datasets/images.md.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calib_json import read_json_object
+from fgslam.cameras.calib_json import read_json_object, rectified_values
 from fgslam.cameras.rig import StereoRig
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.sensors import PoseFrame
-from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
+from fgslam.core.files import make_subfolder, write_bytes, write_text
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig, PoseFrame
+from fgslam.core.types import Trajectory
+from fgslam.datasets.images import (
+    encoded_png,
+    first_size,
+    list_numbered_images,
+    open_frames,
+    require_folder,
+)
 from fgslam.datasets.layouts import files_of, find_cameras
 from fgslam.datasets.ledger import Entry, entry_of_pairs, entry_of_times
 from fgslam.datasets.recording import (
@@ -103,6 +113,34 @@ def open_image_folder(
         return recording
     truth = replace(read_tum(truths[frame]), frame=frame)
     return with_truth(recording, truth, truths[frame], stamps)
+
+
+def write_image_folder(
+    folder: Path, rig: CameraRig, shots: Iterable[tuple[float, Sequence[Image]]]
+) -> None:
+    """Writes images, times and calibration in the layout that :func:`open_image_folder` reads.
+
+    Args:
+        folder: where; it exists.
+        rig: the cameras, rectified.
+        shots: time (s) and images of each frame: right, left[, top].
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    lines = []
+    for i, (t, images) in enumerate(shots):
+        lines.append(f"{i:06d} {t:.9f}\n")
+        for name, image in zip(CAMERA_NAMES, images, strict=False):
+            write_bytes(make_subfolder(folder, name) / f"{i:06d}.png", encoded_png(image))
+    write_text(folder / "times.txt", "".join(lines))
+    write_text(folder / "calib.json", json.dumps(rectified_values(rig), indent=1) + "\n")
+
+
+def write_poses(path: Path, poses: Trajectory) -> None:
+    """Writes poses in TUM's format under this layout's names, which do not end in .tum."""
+    poses.save(path.with_suffix(".tum"))
+    path.with_suffix(".tum").replace(path)
 
 
 def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:

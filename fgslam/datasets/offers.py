@@ -5,19 +5,18 @@ The public ones are named with their licence and the command to type; nothing is
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-import cv2
 import numpy as np
 
 from fgslam.core.errors import ConfigError
-from fgslam.core.files import make_subfolder, require_output, write_bytes, write_text
-from fgslam.core.sensors import CAMERA_NAMES
+from fgslam.core.files import require_output, write_bytes, write_text
 from fgslam.core.types import Trajectory
+from fgslam.datasets.folders import TRUTH_RIGHT, write_image_folder, write_poses
+from fgslam.datasets.images import encoded_png
 
 if TYPE_CHECKING:
     from fgslam.core.arrays import FloatArray, Image
@@ -73,24 +72,17 @@ def offered() -> Iterator[str]:
 def _write_lab(folder: Path, progress: Progress) -> None:
     """Image folder: three cameras, times, odometry of the wheels, exact truth."""
     sequence = lab_sequence()
-    rig, times, count = sequence.rig, sequence.timestamps, len(sequence)
-    for i in range(count):
-        for side, image in zip(CAMERA_NAMES, sequence.frame(i).images, strict=False):
-            _write_image(make_subfolder(folder, side) / f"{i:06d}.png", image)
-        progress("writing", i + 1, count)
-    calibration = {
-        "width": rig.width, "height": rig.height, "fx": rig.fx, "fy": rig.fy, "cx": rig.cx,
-        "cy": rig.cy, "baseline_m": rig.baseline, "vertical_baseline_m": rig.vertical_baseline,
-        "bTc": rig.bTc.tolist(), "rectified": True,
-    }  # fmt: skip
-    write_text(folder / "calib.json", json.dumps(calibration, indent=1) + "\n")
-    lines = [f"{i:06d} {t:.9f}\n" for i, t in enumerate(times)]
-    write_text(folder / "times.txt", "".join(lines))
-    Trajectory(times, np.stack(list(_body_poses(sequence)))).save(folder / "odometry.tum")
-    (folder / "odometry.tum").rename(folder / "odometry.txt")
+    times = sequence.timestamps
+
+    def shots() -> Iterator[tuple[float, Sequence[Image]]]:
+        for i, t in enumerate(times):
+            yield float(t), sequence.frame(i).images
+            progress("writing", i + 1, len(times))
+
+    write_image_folder(folder, sequence.rig, shots())
+    write_poses(folder / "odometry.txt", Trajectory(times, np.stack(list(_body_poses(sequence)))))
     if sequence.ground_truth is not None:
-        sequence.ground_truth.save(folder / "gt_right_cam.tum")
-        (folder / "gt_right_cam.tum").rename(folder / "gt_right_cam.txt")
+        write_poses(folder / TRUTH_RIGHT, sequence.ground_truth)
 
 
 def lab_sequence() -> ImageSequence:
@@ -121,14 +113,10 @@ def _write_house(folder: Path, progress: Progress) -> None:
     poses = world.reference_poses
     for k, (x, y, yaw) in enumerate(poses):
         picture = world.picture(poses[k], k)
-        _write_image(folder / f"{k:03d}.png", picture[..., ::-1])
+        write_bytes(folder / f"{k:03d}.png", encoded_png(picture))
         rows.append(f"{k},{k:03d}.png,{x:.4f},{y:.4f},{np.rad2deg(yaw):.3f}")
         progress("writing", k + 1, len(poses))
     write_text(folder / "poses.csv", "\n".join(rows) + "\n")
-
-
-def _write_image(path: Path, image: Image) -> None:
-    write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 OFFERS: dict[str, Offer] = {

@@ -21,7 +21,6 @@ gantry's units, depth only up to an offset of inverse depth and a scale.
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +31,11 @@ import numpy as np
 from fgslam.cameras.calib_json import pixels, read_json_object
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.files import read_lines, write_bytes, write_text
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.datasets.images import encoded_png, read_grey_image, require_size
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.folders import write_image_folder
+from fgslam.datasets.images import read_grey_image, require_size
 from scripts.convert import run, write_poses
 
 ROW = 8
@@ -93,24 +94,17 @@ def convert(root: Path, folder: Path) -> None:
     shifts = np.repeat(-per_unit * walked[:, None, :], 3, axis=1)
     shifts[:, 1, 0] += per_unit * horizontal
     shifts[:, 2, 1] += per_unit * vertical
-    for k, name in enumerate(("right", "left", "top")):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        for i, group in enumerate(groups):
-            image = shift_image(grid.image(group[k]), shifts[i, k])
-            write_bytes(folder / name / f"{i:06d}.png", encoded_png(image))
-    calibration = {
-        "width": grid.width,
-        "height": grid.height,
-        "fx": FOCAL_PX,
-        "fy": FOCAL_PX,
-        "cx": 0.5 * (grid.width - 1),
-        "cy": 0.5 * (grid.height - 1),
-        "baseline_m": horizontal * METRES_PER_UNIT,
-        "vertical_baseline_m": vertical * METRES_PER_UNIT,
-        "bTc": BODY_FORWARD_LEFT_UP_FROM_CAMERA.tolist(),
-    }
-    write_text(folder / "calib.json", json.dumps(calibration, indent=1) + "\n")
-    write_text(folder / "times.txt", "".join(f"{i} {i}\n" for i in range(len(groups))))
+    cx, cy = 0.5 * (grid.width - 1), 0.5 * (grid.height - 1)
+    rig = CameraRig(
+        grid.width, grid.height, FOCAL_PX, FOCAL_PX, cx, cy,
+        horizontal * METRES_PER_UNIT, vertical * METRES_PER_UNIT, BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    )  # fmt: skip
+    shots = (
+        (float(i), [shift_image(grid.image(group[k]), shifts[i, k]) for k in range(3)])
+        for i, group in enumerate(groups)
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_image_folder(folder, rig, shots)
     poses = np.tile(np.eye(4), (len(groups), 1, 1))
     poses[:, :2, 3] = walked * METRES_PER_UNIT
     write_poses(folder / "gt_right_cam.txt", np.arange(len(groups), dtype=np.float64), poses)
