@@ -100,14 +100,14 @@ def show_parts(
     for line in lines:
         console.out(line)
     for table in tables:
-        for part in fitting_tables(table, console.width):
-            console.print(part)
+        for fitting in fitting_tables(table, console.width):
+            console.print(fitting)
     for label, text in labelled:
         # Sentences are broken between words; paths stay whole.
         room = console.width if label == "note" and console.is_terminal else 0
-        lines = wrap(text, room - _LABEL_WIDTH, break_long_words=False) if room else [text]
-        for k, line in enumerate(lines):
-            console.out(f"{'' if k else label:<{_LABEL_WIDTH}}{line}")
+        parts = wrap(text, room - _LABEL_WIDTH, break_long_words=False) if room else [text]
+        for k, part in enumerate(parts):
+            console.out(f"{'' if k else label:<{_LABEL_WIDTH}}{part}")
 
 
 def _files(result: RunResult) -> Iterator[tuple[str, str]]:

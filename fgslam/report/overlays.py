@@ -160,14 +160,13 @@ def draw_plan(path: Path, data: ReportData) -> None:
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ level.T
     sides = np.diff(bulk_limits(way, dots))[:, 0]
     shape = np.maximum(_ALONE_PX * sides / float(sides.max()), _ALONE_PX // 3)
-    canvas = _Plan(way, dots, truth, (round(shape[0]), round(shape[1]))).drawn(dots, len(way) - 1)
-    words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
+    plan = _Plan(way, dots, truth, (round(shape[0]), round(shape[1])))
     title = f"{data.title}: {one.title}, {len(dots):,} landmarks"
-    _write(path, _headed(_headed(canvas, words, ""), title, ""))
+    _write(path, _headed(_headed(plan.drawn(dots, len(way) - 1), plan.words, ""), title, ""))
 
 
 class _Plan:
-    """Path and landmarks from above, drawn again as they grow."""
+    """Path and landmarks from above, drawn again as they grow; ``words`` say what is what."""
 
     def __init__(
         self, way: FloatArray, dots: FloatArray, truth: FloatArray | None, size: tuple[int, int]
@@ -178,6 +177,7 @@ class _Plan:
         self._middle, self._scale = limits.mean(axis=1), scale
         self._ground = np.full((tall, wide, 3), 255, np.uint8)
         self._way = self._pixels(way)
+        self.words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
         if truth is not None:
             _draw_path(self._ground, self._pixels(truth), INK, 1)
         # The longest of 1, 2 and 5 times a power of ten metres that a third of the picture holds.
@@ -250,14 +250,13 @@ class FilmCanvas:
         tall, wide = _FILM_PX
         room = wide - _FILM_IMAGE_PX - _MARGIN_PX, tall - 2 * _HEADING_PX
         self._plan, self._title = _Plan(path, landmarks, truth, room), title
-        self._words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
 
     def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
         """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
         whole = np.full((*_FILM_PX, 3), 255, np.uint8)
         plan = _headed(self._plan.drawn(known, row), self._title, "")
         whole[: len(plan), -plan.shape[1] :] = plan
-        _put_text(whole, self._words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
+        _put_text(whole, self._plan.words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
         _put_text(whole, moment.title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
         if moment.image is not None:
             panel = self._with_matches(moment, moment.image)

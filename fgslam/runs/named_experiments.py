@@ -32,7 +32,7 @@ def experiments_of_recordings() -> tuple[str, ...]:
 
     Told by one line of each file: what lists them does not load a reader of YAML.
     """
-    files = (find_experiment(Path(name)) for name in experiment_names())
+    files = sorted(experiments_folder().glob("*.yaml"))
     return tuple(f.stem for f in files if _READS.search(f.read_text(encoding="utf-8")))
 
 
