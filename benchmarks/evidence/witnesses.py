@@ -171,18 +171,22 @@ def _accelerating(n: int, step: float) -> FloatArray:
 def room(period: float = 0.0) -> Drive:
     """Along a bend in a room of 8 by 8 m, whose walls repeat themselves after a period."""
     angle = _accelerating(46, 0.045)
-    truth = _level(2.0 - 2.0 * np.cos(angle), 2.0 * np.sin(angle) - 1.0, angle)
+    return _in_room(period, 2.0 - 2.0 * np.cos(angle), 2.0 * np.sin(angle) - 1.0, angle)
+
+
+def _in_room(period: float, x: FloatArray, z: FloatArray, angle: FloatArray) -> Drive:
     quarter = np.pi / 2
-    return rendered(
-        _walls([(0, 4, 0), (4, 0, quarter), (0, -4, 2 * quarter), (-4, 0, -quarter)], 8.0, period),
-        truth,
-    )
+    walls = [(0, 4, 0), (4, 0, quarter), (0, -4, 2 * quarter), (-4, 0, -quarter)]
+    return rendered(_walls(walls, 8.0, period), _level(x, z, angle))
 
 
 def periodic_wall() -> Drive:
     """Sideways before a wall of equal columns."""
-    way = _accelerating(40, 0.3)
-    return rendered(_walls([(6.0, 3.0, 0.0)], 24.0, 0.3), _level(way, 0.0 * way, 0.0 * way))
+    return _along_wall(0.3, _accelerating(40, 0.3))
+
+
+def _along_wall(period: float, way: FloatArray) -> Drive:
+    return rendered(_walls([(6.0, 3.0, 0.0)], 24.0, period), _level(way, 0.0 * way, 0.0 * way))
 
 
 def equal_corridor() -> Drive:
@@ -194,15 +198,13 @@ def equal_corridor() -> Drive:
 
 def sideways() -> Drive:
     """Sideways before a wall, faster and slower."""
-    way = _accelerating(40, 0.12)
-    return rendered(_walls([(6.0, 3.0, 0.0)], 24.0, 0.0), _level(way, 0.0 * way, 0.0 * way))
+    return _along_wall(0.0, _accelerating(40, 0.12))
 
 
 def rotating() -> Drive:
     """On the spot in the middle of the room, once around."""
-    angle, quarter = _accelerating(46, 0.14), np.pi / 2
-    walls = _walls([(0, 4, 0), (4, 0, quarter), (0, -4, 2 * quarter), (-4, 0, -quarter)], 8.0, 0.0)
-    return rendered(walls, _level(0.0 * angle, 0.0 * angle, angle))
+    angle = _accelerating(46, 0.14)
+    return _in_room(0.0, 0.0 * angle, 0.0 * angle, angle)
 
 
 # ------------------------------------------------------------------------------------------
