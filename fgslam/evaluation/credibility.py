@@ -15,7 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, adjoint, inverse
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    adjoint,
+    change_tangent_frame,
+    inverse,
+)
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import (
     Consistency,
@@ -72,15 +77,14 @@ class Tangent:
         return np.asarray(change @ ordered @ np.swapaxes(change, 1, 2))
 
 
-def tangent_errors(estimate: FloatArray, truth: FloatArray, split: bool) -> FloatArray:
-    """Errors (n, 6) of poses, [rotation, translation] along the estimate's axes.
+def tangent_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Errors (n, 6) of poses, [rotation, translation] along the estimate's axes, whole and split.
 
-    ``split``: ``t - t_est`` and ``Log(R_est^T R)``, else ``Log(T_est^-1 T)``.
+    ``Log(T_est^-1 T)``; and ``Log(R_est^T R)`` with ``t - t_est``.
     """
-    errors = pose_errors(estimate, truth)
-    if split:
-        errors[:, 3:] = (inverse(estimate) @ truth)[:, :3, 3]
-    return errors
+    whole = pose_errors(estimate, truth)
+    apart = (inverse(estimate) @ truth)[:, :3, 3]
+    return whole, np.hstack([whole[:, :3], apart])
 
 
 def guess_tangent(
@@ -101,7 +105,7 @@ def guess_tangent(
     choices = [Tangent(o, s, u) for u in ("radians", "degrees") for o in orders for s in _SPACES]
     found = to_estimate_world(estimate, truth)
     rows, true = (found[0][1:], found[1][1:]) if found else (np.empty(0, int), np.empty((0, 4, 4)))
-    errors = [tangent_errors(estimate.poses[rows], true, split) for split in (False, True)]
+    errors = tangent_errors(estimate.poses[rows], true)
     local = {one: one.to_local(estimate.poses, stated) for one in choices}
     fits = [_misfit(local[one][rows], errors[one.split]) for one in choices]
     count = min(independent_count(series) for *_, series in fits) if len(rows) >= _FEWEST else 0.0
@@ -157,8 +161,8 @@ def accumulated(poses: FloatArray, local: FloatArray, lag: int) -> FloatArray:
     Assumed is what dead reckoning does: what is added on the way is independent of what was before.
     NaN where the covariance does not grow so, and the assumption cannot hold.
     """
-    carry = adjoint(inverse(poses[lag:]) @ poses[:-lag])
-    added = local[lag:] - carry @ local[:-lag] @ np.swapaxes(carry, 1, 2)
+    back = inverse(poses[lag:]) @ poses[:-lag]
+    added = local[lag:] - change_tangent_frame(back, local[:-lag])
     lowest = np.linalg.eigvalsh(np.nan_to_num(added))[:, 0]
     grows = lowest >= -1e-9 * np.trace(np.nan_to_num(local[lag:]), axis1=1, axis2=2)
     return np.where(grows[:, None, None], added, np.nan)
@@ -219,9 +223,10 @@ def credibility(
 
     ``split``: as :func:`tangent_errors`; rotation and position alone are always judged so.
     """
-    apart, whole = tangent_errors(poses, truth, True), tangent_errors(poses, truth, split)
+    whole, apart = tangent_errors(poses, truth)
+    errors = apart if split else whole
     found = {
-        "pose": nees(whole, local),
+        "pose": nees(errors, local),
         "rotation": nees(apart[:, :3], local[:, :3, :3]),
         "position": nees(apart[:, 3:], local[:, 3:, 3:]),
     }
@@ -230,5 +235,5 @@ def credibility(
         for name, one in found.items()
     }
     factor = {name: float(np.sqrt(one.per_dof)) if one else None for name, one in judged.items()}
-    shares = {str(k): float(np.nanmean(within(whole, local, k))) for k in (1, 2, 3)}
+    shares = {str(k): float(np.nanmean(within(errors, local, k))) for k in (1, 2, 3)}
     return Credibility(judged, factor, shares)
