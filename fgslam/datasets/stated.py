@@ -23,9 +23,9 @@ from fgslam.datasets.layouts import is_bag
 from fgslam.datasets.times import (
     NANOSECONDS,
     Table,
-    nearest_rows,
     poses_of,
     require_increasing,
+    rows_at,
     time_unit,
 )
 
@@ -110,7 +110,7 @@ def _of_text(path: Path) -> StatedPoses:
     poses = poses_of(table, values[:, 1:4], values[:, [5, 6, 7, 4] if w_first else [4, 5, 6, 7]])
     frame = re.search(r"pose of the (left|right|body)", head)
     trajectory = Trajectory(times, poses, frame[1] if frame else "right")  # type: ignore[arg-type]
-    covariances = None if values.shape[1] == _EUROC else _matrices(table, _POSE)
+    covariances = None if values.shape[1] in (_POSE, _EUROC) else _matrices(table, _POSE)
     notes = () if seconds == 1.0 else (f"times of {path} are read as {unit}",)
     words = _words(head) if covariances is not None else frozenset()
     return StatedPoses(trajectory, covariances, words, "", frame is not None, notes)
@@ -121,7 +121,6 @@ def _joined(found: StatedPoses, path: Path, file: Path) -> StatedPoses:
     table, head = _numbers(file, (*_SIZES, *(1 + n for n in _SIZES)), _ROWS)
     times, timed = found.trajectory.timestamps, table.values.shape[1] not in _SIZES
     matrices = _matrices(table, int(timed))
-    assert matrices is not None  # noqa: S101 - its width was checked
     if not timed and len(table) != len(times):
         raise DatasetError(
             f"{file}: {len(table)} rows without times for the {len(times)} poses of {path}; give a "
@@ -130,14 +129,13 @@ def _joined(found: StatedPoses, path: Path, file: Path) -> StatedPoses:
     if timed:
         stamps = table.values[:, 0] * time_unit(table.values[:, 0])[1]
         require_increasing(table, stamps)
-        rows = nearest_rows(stamps, times)
-        same = np.abs(stamps[rows] - times) <= _SAME_TIME_S
-        if not same.any():
+        rows = rows_at(stamps, times, _SAME_TIME_S)
+        if (rows < 0).all():
             raise DatasetError(
                 f"{file}: from {stamps[0]:.3f} to {stamps[-1]:.3f} s, the poses of {path} from "
                 f"{times[0]:.3f} to {times[-1]:.3f} s: no time is the same; write the poses' times"
             )
-        matrices = np.where(same[:, None, None], matrices[rows], np.nan)
+        matrices = np.where(rows[:, None, None] < 0, np.nan, matrices[rows])
     return replace(found, covariances=matrices, words=_words(head))
 
 
@@ -149,30 +147,24 @@ def _numbers(path: Path, widths: Iterable[int], expected: str) -> tuple[Table, s
     """The rows of a file, and its comments and header in small letters; a comma without these."""
     text = read_text(path, remedy="give a file of poses, or BAG:/topic")
     lines = text.splitlines()
-    header = [
-        k for k, line in enumerate(lines) if re.match(r"\s*(#|(?!nan\b)[a-z_\"]+[,\s])", line, re.I)
-    ]
-    head = " ".join(lines[k].lower() for k in header)
-    plain = "\n".join("" if k in set(header) else line for k, line in enumerate(lines))
-    first = next((line for line in plain.splitlines() if line.strip()), "")
+    heads = [bool(re.match(r"\s*(#|(?!nan\b)[a-z_\"]+[,\s])", line, re.I)) for line in lines]
+    head = " ".join(line.lower() for line, is_head in zip(lines, heads, strict=True) if is_head)
+    rows = ["" if is_head else line for line, is_head in zip(lines, heads, strict=True)]
+    first = next(filter(str.strip, rows), "")
     width = len(first.replace(",", " ").split())
     if width not in widths:
         raise DatasetError(f"{path}: {width} numbers in a row; give {expected}")
-    values, numbers = parse_rows(path, plain.replace(",", " "), width, expected)
+    values, numbers = parse_rows(path, "\n".join(rows).replace(",", " "), width, expected)
     return Table(path, values, numbers), head or ("," if "," in first else "")
 
 
-def _matrices(table: Table, start: int) -> FloatArray | None:
-    """(n, 6, 6) of the numbers from a column on, checked; None where there are none."""
+def _matrices(table: Table, start: int) -> FloatArray:
+    """(n, 6, 6) of the numbers from a column on, checked."""
     numbers = table.values[:, start:]
-    if not numbers.shape[1]:
-        return None
     if numbers.shape[1] == 12:
         out = np.zeros((len(numbers), 6, 6))
-        out[:, :3, :3], out[:, 3:, 3:] = (
-            from_upper(numbers[:, :6], 3),
-            from_upper(numbers[:, 6:], 3),
-        )
+        out[:, :3, :3] = from_upper(numbers[:, :6], 3)
+        out[:, 3:, 3:] = from_upper(numbers[:, 6:], 3)
     else:
         full = numbers.shape[1] == 36
         out = numbers.reshape(-1, 6, 6) if full else from_upper(numbers, 6)
