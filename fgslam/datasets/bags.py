@@ -169,8 +169,9 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     how = "--topics" if settings.topics else "types and names of topics"
     topics = Entry("images", shown, how, "--topics", not settings.topics)
     ledger = (*recording.ledger, topics, entry_of_pairs(unpaired), *unit)
-    recording = replace(recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger)
-    return replace(recording, load_depth=load_depth)
+    return replace(
+        recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger, load_depth=load_depth
+    )
 
 
 # --------------------------------------------------------------------------------------------

@@ -220,8 +220,9 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         entry_of_times(lists, notes, settings.fps),
         entry_of_pairs(notes),
     )
-    recording = replace(recording, disparity_sigma_px=sigma, truth_frame="right", ledger=ledger)
-    recording = replace(recording, load_depth=depth)
+    recording = replace(
+        recording, disparity_sigma_px=sigma, truth_frame="right", ledger=ledger, load_depth=depth
+    )
     if not truth.is_file():
         return recording
     return with_truth(recording, read_tum(truth), truth, stamps)
