@@ -27,8 +27,10 @@ from fgslam.core.sensors import (
 from fgslam.core.types import Estimate, Trajectory, read_covariances
 from fgslam.datasets.images import Depth, encoded_png
 from fgslam.datasets.layouts import is_recording
+from fgslam.datasets.odometry import STAMP_TOLERANCE_S
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
+from fgslam.datasets.times import rows_at
 from fgslam.report.content import read_metrics
 from fgslam.report.formats import (
     MCAP_SUFFIX,
@@ -596,8 +598,8 @@ def frames_of(
         if (load := recording.load_depth) is not None:
             numbers = recording.indices.tolist()
             depths = lambda i: load(numbers[i])  # noqa: E731
-    rows = np.searchsorted(stamps, trajectory.timestamps - 1e-9)
-    if (rows >= len(stamps)).any() or np.abs(stamps[rows] - trajectory.timestamps).max() > 1e-6:
+    rows = rows_at(stamps, trajectory.timestamps, STAMP_TOLERANCE_S)
+    if (rows < 0).any():
         raise DatasetError(
             f"the recording {dataset.path if hasattr(dataset, 'path') else dataset.kind} has other "
             "times than the run; give the run's own recording"
