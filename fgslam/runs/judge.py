@@ -343,17 +343,27 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
 
 def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
     """The log with every second landmark alone; those that a loop merges stay together."""
-    root: dict[int, int] = {}
-    for one in log:
-        for loop in one.loops:
-            root |= {a: root.get(b, b) for a, b in loop.merged.tolist()}
+    stays: dict[int, int] = {}
+
+    def root(identity: int) -> int:
+        while identity in stays:
+            identity = stays[identity]
+        return identity
+
+    for loop in (loop for one in log for loop in one.loops):
+        for pair in loop.merged.tolist():
+            ends, stay = map(root, pair)
+            if ends != stay:
+                stays[ends] = stay
 
     def kept(ids: IntArray) -> BoolArray:
-        return np.array([root.get(i, i) % 2 == half for i in ids.tolist()], np.bool_)
+        return np.array([root(i) % 2 == half for i in ids.tolist()], np.bool_)
 
     out = MeasurementLog(log.rig, log.motion_model)
     for one in log:
-        mine = kept(one.observations.ids)
+        mine, missed, pruned = (
+            kept(ids) for ids in (one.observations.ids, one.missed_ids, one.pruned_ids)
+        )
         loops = tuple(
             replace(
                 loop,
@@ -362,8 +372,13 @@ def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
             )
             for loop in one.loops
         )
-        half_seen = one.observations.select(mine), one.rejected[mine]
-        missed, pruned = (ids[kept(ids)] for ids in (one.missed_ids, one.pruned_ids))
-        out.append(replace(one, observations=half_seen[0], rejected=half_seen[1],
-                           missed_ids=missed, pruned_ids=pruned, loops=loops))  # fmt: skip
+        half_of_one = replace(
+            one,
+            observations=one.observations.select(mine),
+            rejected=one.rejected[mine],
+            missed_ids=one.missed_ids[missed],
+            pruned_ids=one.pruned_ids[pruned],
+            loops=loops,
+        )
+        out.append(half_of_one)
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,10 @@ import fgslam as fg
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.geometry import se3_exp
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, LoopClosure
 from fgslam.core.types import Trajectory, pose_rows
+from fgslam.runs.judge import half_of
 
 FRAMES = 80
 SIGMA = np.repeat([0.004, 0.05], 3)
@@ -142,3 +146,21 @@ def test_what_cannot_be_judged_is_refused_in_a_line(tmp_path: Path, truth: Path)
         fg.judge([file, late], truth, covariance=file)
     with pytest.raises(ConfigError, match=r"covariances of shape \(3, 6, 6\); give \(80, 6, 6\)"):
         fg.judge((located(), covariances()[:3]), TRUTH)
+
+
+def test_landmarks_that_loops_merge_one_after_another_are_of_one_half() -> None:
+    """Landmark 9 turned out to be 4, that to be 3; 6 is another one."""
+    log, nothing = MeasurementLog(), Increment.of(0, 0.0, None)
+    for k, pairs in enumerate([(), ((9, 4),), ((4, 3),)]):
+        loops = [
+            LoopClosure(0, np.eye(4), np.eye(6), nothing.observations, np.array([pair]))
+            for pair in pairs
+        ]
+        ids = np.array([9, 4, 3, 6])
+        log.append(
+            replace(nothing, index=k, timestamp=float(k), missed_ids=ids, loops=tuple(loops))
+        )
+    halves = [half_of(log, half) for half in (0, 1)]
+    assert [one.missed_ids.tolist() for one in halves[0]] == 3 * [[6]]
+    assert [one.missed_ids.tolist() for one in halves[1]] == 3 * [[9, 4, 3]]
+    assert [len(loop.merged) for one in halves[1] for loop in one.loops] == [1, 1]
