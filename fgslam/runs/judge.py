@@ -39,6 +39,7 @@ from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import TextTable, read_metrics, write_json
 from fgslam.report.results import NO_LANDMARKS, ReportData, judged_report
 from fgslam.runs.config import load_config
+from fgslam.runs.export import results_folder
 from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE
 from fgslam.runs.tables import JUDGED_COLUMNS, judged_tables
@@ -227,7 +228,7 @@ def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Pat
         return StatedPoses(*one, frozenset(("rotation_first", "local", "radians"))), None
     path = Path(one)
     if is_run_folder(path):
-        path = path / load_config(path / RUN_MARKER).estimator.title
+        path = path / results_folder(path, None)
     path = path / _FINAL if (path / _FINAL).is_file() else path
     known = path.with_name("covariance.csv")
     if path.name == _FINAL and covariance is None and known.is_file():

@@ -140,6 +140,10 @@ def test_what_cannot_be_judged_is_refused_in_a_line(tmp_path: Path, truth: Path)
         fg.judge(bare, truth)
     with pytest.raises(ConfigError, match=r"vio: is no run of fgslam.* give --truth FILE"):
         fg.judge(file)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("name: drive")
+    with pytest.raises(DatasetError, match="run: holds no results yet; resume the run first"):
+        fg.judge(tmp_path / "run", truth)
     with pytest.raises(ConfigError, match="no word 'lokal'; use rotation_first"):
         fg.judge(file, truth, tangent="lokal")
     with pytest.raises(ConfigError, match="--covariance is of one estimate, and 2 are given"):
