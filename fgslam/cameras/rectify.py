@@ -68,7 +68,11 @@ class Rectifier(Brief):
 
     def images(self, raw: Sequence[Image]) -> tuple[Image, ...]:
         """Rectified (right, left[, top]) of raw images given in that order."""
-        return tuple(self.rectify(k, raw[self.order[k]]) for k in range(self.rig.cameras))
+        return tuple(self.image(k, raw) for k in range(self.rig.cameras))
+
+    def image(self, camera: int, raw: Sequence[Image]) -> Image:
+        """One of these."""
+        return self.rectify(camera, raw[self.order[camera]])
 
     def raw_pixels(self, camera: int, pixels: FloatArray) -> FloatArray:
         """Where rectified pixels (n, 2) of a camera lie in its raw image (n, 2), bilinear."""

@@ -512,8 +512,8 @@ class Slam(Session):
             seen = self.recorder.log.increments[-1].observations
             new = seen.select(seen.is_new)
             left, right, *top = map(_eight_bits, shown)
-            if isinstance(self.rig, StereoRig):
-                right = self.rig.rectified((right, left, *top))[0]
+            if isinstance(self.rig, StereoRig) and self.rig.rectifier is not None:
+                right = self.rig.rectifier.image(0, (right, left, *top))
             column, row = np.rint(new.pixels[:, 0]).astype(np.int64).T
             self._colours |= dict(zip(new.ids.tolist(), right[row, column, :3], strict=True))
         return step
