@@ -20,7 +20,7 @@ from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import compose_covariance
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Odometry
-from fgslam.core.types import Estimate, LandmarkMap, Trajectory
+from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory
 from fgslam.factors.graphs import solver_parameters
 from fgslam.factors.models import RangeBearing
 
@@ -259,8 +259,7 @@ def _solved(
             covariances[row][np.ix_(_PLANAR, _PLANAR)] = found
         else:
             covariances[row] = found
-    none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-    estimate = Estimate(Trajectory(np.array(keys, np.float64), poses), covariances, none)
+    estimate = Estimate(Trajectory(np.array(keys, np.float64), poses), covariances, NO_LANDMARKS)
     chi_square = 2.0 * _whole(graph, first).error(values)
     return SolvedGraph(values, estimate, chi_square, np.array(seconds))
 

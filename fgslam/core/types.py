@@ -504,6 +504,10 @@ class LandmarkMap(Rows):
         return rows
 
 
+NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+"""A map without any."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Prediction(Brief):
     """Pose expected before the frame's observations: ``wTc`` (4, 4) and its covariance (6, 6)."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.types import Estimate, LandmarkMap, Trajectory
+from fgslam.core.types import NO_LANDMARKS, Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Nees,
@@ -25,8 +25,6 @@ from fgslam.evaluation.statistics import (
 )
 from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import Picture, TextTable
-
-NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from fgslam.core.sensors import (
     pixel_model,
     vertical_to_horizontal,
 )
-from fgslam.core.types import Estimate, Trajectory, read_covariances
+from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory, read_covariances
 from fgslam.datasets.images import Depth, encoded_png
 from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.odometry import STAMP_TOLERANCE_S
@@ -45,7 +45,6 @@ from fgslam.report.formats import (
     write_map,
     write_trajectory,
 )
-from fgslam.report.results import NO_LANDMARKS
 from fgslam.report.surface import FREE, OCCUPIED, require_cloud_suffix
 from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
 from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse

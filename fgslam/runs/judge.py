@@ -18,7 +18,7 @@ from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.files import as_path, make_subfolder
 from fgslam.core.geometry import change_tangent_frame, inverse, pose
 from fgslam.core.log import MeasurementLog
-from fgslam.core.types import LAGS, Estimate, Trajectory
+from fgslam.core.types import LAGS, NO_LANDMARKS, Estimate, Trajectory
 from fgslam.datasets.stated import TANGENT_WORDS, StatedPoses, read_stated
 from fgslam.evaluation.credibility import (
     Tangent,
@@ -37,7 +37,7 @@ from fgslam.evaluation.statistics import (
 )
 from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import TextTable, read_metrics, write_json
-from fgslam.report.results import NO_LANDMARKS, ReportData, judged_report
+from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.config import load_config
 from fgslam.runs.export import results_folder
 from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE, RUN_MARKER, is_run_folder

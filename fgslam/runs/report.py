@@ -19,6 +19,7 @@ from fgslam.core.files import make_subfolder
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import vertical_of
 from fgslam.core.types import (
+    NO_LANDMARKS,
     EgoMotionStatus,
     Estimate,
     LandmarkMap,
@@ -51,7 +52,6 @@ from fgslam.report.content import (
 from fgslam.report.formats import read_ply
 from fgslam.report.overlays import draw_plan
 from fgslam.report.results import (
-    NO_LANDMARKS,
     EstimatorReport,
     ReportData,
     judged_report,

@@ -28,10 +28,10 @@ from fgslam.core.sensors import Increment, MeasurementType, Observations
 from fgslam.core.stopwatch import Stopwatch
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import (
+    NO_LANDMARKS,
     EgoMotion,
     EgoMotionStatus,
     Estimate,
-    LandmarkMap,
     Prediction,
     Trajectory,
     UpdateStats,
@@ -293,8 +293,7 @@ class _Replaying:
             final_ms = math.nan if why else 1e3 * (time.perf_counter() - start)
             failure = "; ".join(filter(None, (failure, why)))
         else:
-            none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-            estimate = Estimate(online, covariances, none)
+            estimate = Estimate(online, covariances, NO_LANDMARKS)
         return Replay(
             title=getattr(self._settings, "title", self._settings.kind),
             kind=self._settings.kind,

@@ -18,9 +18,9 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Observations
 from fgslam.core.store import Kept
 from fgslam.core.types import (
+    NO_LANDMARKS,
     EgoMotionStatus,
     Estimate,
-    LandmarkMap,
     Remark,
     StereoFeatures,
     Trajectory,
@@ -325,8 +325,9 @@ def estimate_of_failed(
             raise ValueError("a landmark of the final map is not finite")
     except ESTIMATOR_FAULTS as error:
         remark = ("the final trajectory is the online one: no final estimate could be had",)
-        none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        return Estimate(online, covariances, none, remark), f"no final estimate: {reason(error)}"
+        return Estimate(
+            online, covariances, NO_LANDMARKS, remark
+        ), f"no final estimate: {reason(error)}"
     poses = Trajectory(found.trajectory.timestamps[:n], found.trajectory.poses[:n])
     relative = {lag: one[: max(n - lag, 0)] for lag, one in found.relative.items()}
     covariances = found.covariances[:n]

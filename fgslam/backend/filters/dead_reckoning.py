@@ -22,7 +22,15 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig, Increment, MeasurementType, Observations, Odometry
 from fgslam.core.store import Kept
-from fgslam.core.types import LAGS, EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.types import (
+    LAGS,
+    NO_LANDMARKS,
+    EgoMotion,
+    Estimate,
+    LandmarkMap,
+    Prediction,
+    UpdateStats,
+)
 
 
 class DeadReckoning:
@@ -40,7 +48,7 @@ class DeadReckoning:
         self._sensor = sensor
         self._current = prior
         self._past = FilteredTrajectory()
-        self._map = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        self._map = NO_LANDMARKS
         self._first_frame = np.empty(0, np.int64)
 
     def predict(self, odometry: Odometry | None) -> Prediction:

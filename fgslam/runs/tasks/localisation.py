@@ -26,7 +26,7 @@ from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import Floor, LandmarkMap, Relocalisation, StereoFeatures
+from fgslam.core.types import NO_LANDMARKS, Floor, LandmarkMap, Relocalisation, StereoFeatures
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.evaluation.localisation import (
     Answers,
@@ -338,8 +338,7 @@ def _run(
     if given is None:
         ended = drive_first(config.as_experiment(), context)
         if ended is not None and ended.status == "interrupted":
-            none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-            nothing = Asked((), none, "the map was not finished", whole=False)
+            nothing = Asked((), NO_LANDMARKS, "the map was not finished", whole=False)
             return result_of(config, folder, nothing, sequence.notes)
         given = open_map(folder / FIRST_FOLDER / MAP_FILE)
         write_config(folder, config, _provenance(given, sequence))

@@ -13,8 +13,7 @@ from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.geometry import pose
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Observations
-from fgslam.core.types import Estimate, Trajectory
-from fgslam.report.results import NO_LANDMARKS
+from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory
 from fgslam.runs.dense import DenseMap, DenseSettings, fuse
 
 PLACES = [np.array([0.1 * k, 0.0, 0.05 * k]) for k in range(4)]
