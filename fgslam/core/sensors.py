@@ -303,6 +303,11 @@ class CameraRig(Brief):
     angles = ()  # none of the three is one
 
     @property
+    def matrix(self) -> FloatArray:
+        """(3, 3) intrinsics: pixels of what is seen along a ray of depth one."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
     def angles_deg(self) -> tuple[float, float]:
         """Horizontal and vertical angle of view around the middle of the image, degrees."""
         half = 0.5 * np.array([self.width / self.fx, self.height / self.fy])

@@ -69,13 +69,12 @@ def judged_turns(recording: Recording) -> Judged:
     change = np.linalg.norm(np.diff(rates, axis=0, prepend=rates[:1]), axis=1)
     change = np.where(np.isfinite(change), change, -1.0)
     chosen = np.argsort(-change, kind="stable")[:_STEPS]
-    camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
     features: dict[int, FrameFeatures] = {}
     rows, turns = [], []
     for i in (np.sort(chosen[change[chosen] >= 0.0]) + 1).tolist():
         for k in (i - 1, i):
             features[k] = features.get(k) or _features_of(recording, k)
-        turn = turn_between(features[i - 1], features[i], camera)
+        turn = turn_between(features[i - 1], features[i], rig.matrix)
         features = {i: features[i]}
         if turn is not None:
             rows.append(i)

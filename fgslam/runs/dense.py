@@ -194,7 +194,7 @@ def fuse(
             "it out"
         )
     most = settings.range_m or min(farthest, float(np.sqrt(TRUNCATION_VOXELS * voxel / noise)))
-    fusion, scans = Fusion(_matrix(rig), voxel), []
+    fusion, scans = Fusion(rig.matrix, voxel), []
     for done, k in enumerate(used):
         progress("fusing", done, len(used))
         try:
@@ -233,10 +233,6 @@ def _readable(read: Callable[[int], _Read], rows: Sequence[int]) -> list[_Read]:
         except FrameError:
             continue
     return found
-
-
-def _matrix(rig: CameraRig) -> FloatArray:
-    return np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
 
 
 def _rays(rig: CameraRig) -> Float32:

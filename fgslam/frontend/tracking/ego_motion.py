@@ -463,12 +463,11 @@ class Resection:
 
     def _start_of_one_image(self, problem: PoseProblem) -> FloatArray:
         """(1 or 0, 4, 4) the pose by directions alone (Gao et al. 2003), that most agree with."""
-        rig, none = self._solver.sensor, np.empty((0, 4, 4))
+        none = np.empty((0, 4, 4))
         if len(problem) < _FEWEST_DIRECTIONS:
             return none
-        matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
         found, turn, shift, _ = cv2.solvePnPRansac(
-            problem.points, problem.measurement[:, :2].copy(), matrix, None,
+            problem.points, problem.measurement[:, :2].copy(), self._solver.sensor.matrix, None,
             iterationsCount=_DRAWN, confidence=_SURE,
             reprojectionError=_NEAR * self._solver.farthest, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
