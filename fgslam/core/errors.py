@@ -7,7 +7,10 @@ wrong, where, and how to correct it. The command line catches the root once and 
 from __future__ import annotations
 
 import re
-import typing
+
+TYPE_CHECKING = False  # as in typing, whose import takes as long as all else of fgslam
+if TYPE_CHECKING:
+    from typing import Any
 
 _ECHOED = 200
 """Characters of what was given that a message repeats at most."""
@@ -52,7 +55,7 @@ class FrameError(DatasetError):
 class OneImageError(FrameError):
     """Not all images of a frame can be read; ``frame`` has black ones in place of the others."""
 
-    frame: typing.Any
+    frame: Any
 
 
 class CalibrationError(DatasetError):
