@@ -82,13 +82,14 @@ def with_uncertain_rig(graph: WholeGraph, state: State, rig: RigCorrection) -> B
         state, lambda measured: shifts(rig.rig, measured, modes > 0)[..., terms]
     )
     gain = held.solve(pull)
-    information = own + pull.T @ gain[: len(pull)]
-    # One that is estimated is known by what the drive has shown; else it is taken to be zero.
-    of_terms = prior if rig.rig.stated else information[:p, :p] + prior
-    correction = np.linalg.inv(0.5 * (of_terms + of_terms.T))
-    # What was applied leant with the field, too: as much, but by other frames, as a graph's would.
-    lean = rig.field_px * correction @ information[:p, p + len(shared) :]
-    correction = rig.covariance if rig.rig.stated else correction + lean @ lean.T
+    correction = rig.covariance
+    if not rig.rig.stated:  # it is known by what the drive has shown
+        information = own + pull.T @ gain[: len(pull)]
+        of_terms = information[:p, :p] + prior
+        correction = np.linalg.inv(0.5 * (of_terms + of_terms.T))
+        # What was applied leant with the field, too: as much, but by other frames, as a graph's.
+        lean = rig.field_px * correction @ information[:p, p + len(shared) :]
+        correction = correction + lean @ lean.T
     covariance = np.asarray(block_diag(correction, shared, rig.field_px**2 * np.eye(modes)))
     return Bordered(held, gain, covariance, np.zeros(len(covariance)))
 
