@@ -51,8 +51,8 @@ class Sightings(Rows):
     """Observations of landmarks by one model.
 
     Attributes:
-        poses: keys (k,) of their poses; in a :class:`WholeGraph` their rows.
-        points: of their landmarks, alike.
+        poses: keys (k,) of their poses; in a :class:`WholeGraph` their rows, in a window frames.
+        points: of their landmarks, alike; in a window variables.
         measured: (k, m).
         roots: (k, m, m) square roots of their informations.
         model: of the sensor.
@@ -68,7 +68,7 @@ class Sightings(Rows):
     model: Any
     xTs: FloatArray | None = None
 
-    def at_rows(self, poses: list[int], landmarks: list[int]) -> Sightings:
+    def at_rows(self, poses: Sequence[int], landmarks: Sequence[int] | IntArray) -> Sightings:
         """By rows among these keys, which ascend."""
         of_pose = np.searchsorted(np.array(poses, np.int64), self.poses)
         of_landmark = np.searchsorted(np.array(landmarks, np.int64), self.points)
@@ -138,6 +138,15 @@ class Sightings(Rows):
         order = np.lexsort((self.points, self.poses))
         start = np.searchsorted(self.poses[order], np.arange(n + 1))
         return bsr_matrix((blocks[order], self.points[order], start), (6 * n, 3 * m))
+
+
+def by_kind(parts: Iterable[Sightings]) -> dict[str, Sightings]:
+    """Those of each kind of model joined, in their order."""
+    joined: dict[str, Sightings] = {}
+    for one in parts:
+        kind = one.model.kind
+        joined[kind] = joined[kind].join(one) if kind in joined else one
+    return joined
 
 
 def values_of(keys: dict[int, int], poses: FloatArray, points: FloatArray) -> Any:

@@ -86,7 +86,7 @@ def with_uncertain_rig(graph: WholeGraph, state: State, rig: RigCorrection) -> B
     if not rig.rig.stated:  # it is known by what the drive has shown
         information = own + pull.T @ gain[: len(pull)]
         of_terms = information[:p, :p] + prior
-        correction = np.linalg.inv(0.5 * (of_terms + of_terms.T))
+        correction = np.asarray(np.linalg.inv(0.5 * (of_terms + of_terms.T)), np.float64)
         # What was applied leant with the field, too: as much, but by other frames, as a graph's.
         lean = rig.field_px * correction @ information[:p, p + len(shared) :]
         correction = correction + lean @ lean.T

@@ -31,7 +31,14 @@ from fgslam.backend.persistence import Persistence, StatedNoise
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
-from fgslam.backend.smoothers.bundle import Sightings, State, Turn, TurnedStep, WholeGraph
+from fgslam.backend.smoothers.bundle import (
+    Sightings,
+    State,
+    Turn,
+    TurnedStep,
+    WholeGraph,
+    by_kind,
+)
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.correction import FIELD_PX, RigCorrection
 from fgslam.core.errors import EstimatorError
@@ -256,9 +263,7 @@ class GraphBuilder:
         if self._remember:
             gone = np.zeros(len(new.sightings), np.bool_)
             self.observed.append(_columns(new.sightings) | {"gone": gone})
-            for one in new.measured:
-                kind, before = one.model.kind, self.measured.get(one.model.kind)
-                self.measured[kind] = one if before is None else before.join(one)
+            self.measured = by_kind([*self.measured.values(), *new.measured])
         return new
 
     def take_out(self, variable: int) -> str:

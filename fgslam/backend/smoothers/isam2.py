@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.backend.loops import Chain, Constraint, constraint_factor
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
-from fgslam.backend.smoothers.bundle import Sightings, State, WholeGraph, keys_of
+from fgslam.backend.smoothers.bundle import Sightings, State, WholeGraph, by_kind, keys_of
 from fgslam.backend.smoothers.final import Refined, WholeGraphSolver, refine
 from fgslam.backend.smoothers.graph import (
     NewFactors,
@@ -331,13 +331,10 @@ class LinearFactors:
 
     def _join(self) -> None:
         """Brings new measurements to those of the same kind."""
-        kinds: dict[str, Sightings] = {}
-        for one in self.measured:
-            before = kinds.get(one.model.kind)
-            kinds[one.model.kind] = one if before is None else before.join(one)
-        self.measured = list(kinds.values())
-        self._at += [(np.empty((0, 4, 4)), np.empty((0, 3)))] * (len(kinds) - len(self._at))
-        self._slots += [np.empty(0, np.int64)] * (len(kinds) - len(self._slots))
+        self.measured = list(by_kind(self.measured).values())
+        new = len(self.measured) - len(self._at)
+        self._at += [(np.empty((0, 4, 4)), np.empty((0, 3)))] * new
+        self._slots += [np.empty(0, np.int64)] * new
         for k, one in enumerate(self.measured):
             more = len(one) - len(self._slots[k])
             poses, points = self._at[k]

@@ -22,7 +22,7 @@ from fgslam.backend.loops import home_changes, rotated, transported
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.admission import LEAST_PARALLAX
-from fgslam.backend.smoothers.bundle import Sightings
+from fgslam.backend.smoothers.bundle import Sightings, by_kind
 from fgslam.backend.smoothers.elimination import (
     Eliminated,
     Equations,
@@ -54,28 +54,11 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
 from fgslam.factors.landmark import summed, weighed
-from fgslam.factors.measurement import LinearRows, linearise, products, whitening
+from fgslam.factors.measurement import LinearRows, products, whitening
 from fgslam.factors.noise import kernel_weights
 
 # ------------------------------------------------------------------------------------------
 # What a window of poses and landmarks is made of, and what it answers
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observed(Rows):
-    """Observations of the window (k, ...): frame, landmark variable, numbers and whitening.
-
-    All by one sensor, at ``xTs`` (4, 4) in the frame of the poses; None: they are its own.
-    """
-
-    SHARED = frozenset({"model", "xTs"})
-
-    frame: IntArray
-    variable: IntArray
-    measurement: FloatArray
-    root: FloatArray
-    model: Any
-    xTs: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -591,8 +574,8 @@ class Window:
         self.poses = np.empty((0, 4, 4))
         none = np.empty(0, np.int64)
         self.landmarks = Landmarks(none, np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
-        self.observed = Observed(none, none, np.empty((0, 3)), np.empty((0, 3, 3)), sensor)
-        self.measured: dict[str, Observed] = {}
+        self.observed = Sightings(none, none, np.empty((0, 3)), np.empty((0, 3, 3)), sensor)
+        self.measured: dict[str, Sightings] = {}
         self.factors = gtsam.NonlinearFactorGraph()
         self.prior = WindowPrior.none()
         self.places: dict[int, FloatArray] = {}
@@ -619,22 +602,21 @@ class Window:
         self, frame: IntArray, variable: IntArray, measurement: FloatArray, noise: FloatArray
     ) -> None:
         """Observations (k,) of landmarks of the window from its frames; noise (k, 3, 3)."""
-        new = Observed(frame, variable, measurement, whitening(noise), self.observed.model)
+        new = Sightings(frame, variable, measurement, whitening(noise), self.observed.model)
         self.observed = self.observed.join(new)
 
     def measure(self, seen: Sightings) -> None:
         """What another sensor measured of landmarks of the window."""
         frame, variable = seen.poses - pose_key(0), seen.points - landmark_key(0)
-        new = Observed(frame, variable, seen.measured, seen.roots, seen.model, seen.xTs)
-        kind = new.model.kind
-        self.measured[kind] = self.measured[kind].join(new) if kind in self.measured else new
+        new = dataclasses.replace(seen, poses=frame, points=variable)
+        self.measured = by_kind([*self.measured.values(), new])
 
     def remeasure(self, change: RigChange) -> None:
         """Corrects the observations of the frames that the change is of."""
         seen = self.observed
-        late = (seen.frame >= change.since)[:, None]
-        again = np.where(late, change.measured(seen.measurement), seen.measurement)
-        self.observed = dataclasses.replace(seen, measurement=again)
+        late = (seen.poses >= change.since)[:, None]
+        again = np.where(late, change.measured(seen.measured), seen.measured)
+        self.observed = dataclasses.replace(seen, measured=again)
 
     # -- the solution ------------------------------------------------------------------------
 
@@ -695,22 +677,17 @@ class Window:
 
     # -- linearising -------------------------------------------------------------------------
 
-    def _rows(self, observed: Observed) -> tuple[IntArray, IntArray]:
-        """Rows of the observations' poses and landmarks."""
-        pose = np.searchsorted(self.frames, observed.frame).astype(np.int64)
-        return pose, np.searchsorted(self.landmarks.variables, observed.variable).astype(np.int64)
-
     def _tied(self) -> IntArray:
         """(p,) rows of the landmarks that the prior speaks of."""
         return np.searchsorted(self.landmarks.variables, self.prior.variables).astype(np.int64)
 
-    def linearise(self, observed: Observed) -> Look:
+    def linearise(self, observed: Sightings) -> Look:
         """Some of the window's observations; a kernel weighs each where it is linearised."""
-        (pose, point), o, kernel = self._rows(observed), observed, self.kernel
-        at, places = self._where_linearised()
-        rows = linearise(o.model, at[pose], places[point], o.measurement, o.root, o.xTs)
+        seen, kernel = observed.at_rows(self.frames, self.landmarks.variables), self.kernel
+        pose, point, (at, places) = seen.poses, seen.points, self._where_linearised()
+        rows = seen.look(at, places)
         squared = np.einsum("ki,ki->k", rows.residual, rows.residual)
-        name = kernel.name if o.model is self.observed.model else "none"  # stated noise is true
+        name = kernel.name if seen.model is self.observed.model else "none"  # stated noise is true
         weight = kernel_weights(name, kernel.width, squared)
         residual = rows.residual + products(rows.by_point, (self.landmarks.points - places)[point])
         residual += products(rows.by_pose, self._shift[pose])
@@ -751,7 +728,7 @@ class Window:
         )
 
     @property
-    def _every(self) -> list[Observed]:
+    def _every(self) -> list[Sightings]:
         """The observations of all sensors."""
         return [self.observed, *self.measured.values()]
 
@@ -803,15 +780,15 @@ class Window:
             factor = self.factors.at(row)
             earliest = min(number(key) for key in list(factor.keys()))
             (touched if earliest < first else untouched).add(factor)
-        gone = [self.linearise(one.select(one.frame < first)) for one in self._every]
+        gone = [self.linearise(one.select(one.poses < first)) for one in self._every]
         self._into_prior(gone, touched, leaving)
         self.factors = untouched
-        self._keep(lambda one: one.frame >= first)
+        self._keep(lambda one: one.poses >= first)
         self._drop_poses(leaving)
-        left = np.concatenate([one.variable for one in self._every])
+        left = np.concatenate([one.points for one in self._every])
         return self._eliminate(~np.isin(self.landmarks.variables, left))
 
-    def _keep(self, which: Callable[[Observed], BoolArray]) -> None:
+    def _keep(self, which: Callable[[Sightings], BoolArray]) -> None:
         """Those observations alone that a mask chooses."""
         self.observed = self.observed.select(which(self.observed))
         self.measured = {kind: one.select(which(one)) for kind, one in self.measured.items()}
@@ -918,7 +895,7 @@ class Window:
 
     def take_out(self, variable: int) -> None:
         """Takes a landmark out, with what the window's poses saw of it."""
-        self._keep(lambda one: one.variable != variable)
+        self._keep(lambda one: one.points != variable)
         self._eliminate(self.landmarks.variables == variable)
 
     def carried_along(self, by: FloatArray, prior: Any, saved: IntArray = _NONE) -> None:

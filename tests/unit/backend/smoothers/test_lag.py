@@ -116,7 +116,7 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
         window = estimator.solver.window
         counts.append(
             (
-                len(window.observed.frame),
+                len(window.observed),
                 len(window.landmarks.variables),
                 window.prior.hidden,
                 len(window.frames),
@@ -413,8 +413,8 @@ def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:
         zip(zip(frames.tolist(), variables.tolist(), strict=True), measured, strict=True)
     )
     seen = solver.window.observed
-    assert seen.frame.max() == 6
-    for frame, variable, found in zip(seen.frame, seen.variable, seen.measurement, strict=True):
+    assert seen.poses.max() == 6
+    for frame, variable, found in zip(seen.poses, seen.points, seen.measured, strict=True):
         np.testing.assert_allclose(found, expected[frame, variable], rtol=0, atol=1e-9)
 
 

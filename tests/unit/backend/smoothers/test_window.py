@@ -49,7 +49,7 @@ def assert_same(found: FloatArray, expected: FloatArray) -> None:
 
 
 def test_what_has_left_leaves_the_covariances_as_they_were(window: Window) -> None:
-    inside = np.unique(window.observed.variable[window.observed.frame >= FIRST])
+    inside = np.unique(window.observed.points[window.observed.poses >= FIRST])
     expected = joint(window, inside)
     window.let_go_before(FIRST)
     assert window.frames == list(range(FIRST, FRAMES))
@@ -84,7 +84,7 @@ def test_the_place_of_rest_stays(window: Window) -> None:
 
 def test_an_observation_is_weighed_and_linearised_where_the_prior_was(window: Window) -> None:
     window.let_go_before(FIRST)
-    tied = np.isin(window.observed.variable, window.prior.variables)
+    tied = np.isin(window.observed.points, window.prior.variables)
     before = window.linearise(window.observed).rows
     moved = dataclasses.replace(window.landmarks, points=window.landmarks.points + 0.5)
     window.landmarks = moved
