@@ -484,7 +484,8 @@ class GraphBuilder:
                     self._waiting.setdefault(identity, []).append(
                         (frame, each.select(np.array([row])))
                     )
-        for identity in np.intersect1d(list(self._waiting), landmarks.ids).tolist():
+        waiting = np.array(sorted(self._waiting), np.int64)
+        for identity in waiting[np.isin(waiting, landmarks.ids)].tolist():
             track = self.admission.tracks.get(identity)
             if track is None or not track.by_camera:
                 track = self.admission.sighted(identity, Sighting.by_others(frame))

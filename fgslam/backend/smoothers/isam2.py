@@ -100,16 +100,22 @@ class Isam2Solver(WholeGraphSolver):
         self._update(graph, values)
 
     def _update(self, graph: Any, values: Any) -> None:
-        together = gtsam.Values(self.values)
-        together.insert(values)
-        moved, linear = self._linear.renewed(together)
-        try:
+        moved: list[int] = []
+        if self._linear.measured:
+            moved, linear = self._linear.renewed(self._with(values))
             graph.push_back(linear)
+        try:
             result = self.tree.update(graph, values, moved, self._groups())
             self._linear.took(result.getNewFactorsIndices())
             self.values = self.tree.calculateEstimate()
         except RuntimeError as error:
-            self._repair(together, error)
+            self._repair(self._with(values), error)
+
+    def _with(self, values: Any) -> Any:
+        """All values: a copy of those of the tree, with new ones."""
+        together = gtsam.Values(self.values)
+        together.insert(values)
+        return together
 
     def _groups(self) -> Any:
         """Constrained ordering: the last poses in the last group; None for GTSAM's own."""
@@ -161,15 +167,12 @@ class Isam2Solver(WholeGraphSolver):
 
     def solve_whole(self) -> Refined:
         """The minimum from the tree's values, with those of frames that wait."""
-        values = gtsam.Values(self.values)
-        values.insert(self.new_values)
-        return refine(self.builder, values, self._minimise)
+        return refine(self.builder, self._with(self.new_values), self._minimise)
 
     def recalibrate(self, change: RigChange) -> None:
         """Rebuilds the tree, of the new measurements."""
         super().recalibrate(change)
-        together = gtsam.Values(self.values)
-        together.insert(self.new_values)
+        together = self._with(self.new_values)
         if together.empty():
             return
         self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -292,8 +295,6 @@ class LinearFactors:
     def renewed(self, values: Any) -> tuple[list[int], Any]:
         """Slots of the tree to empty, and factors to add, at values of all variables."""
         graph, emptied = gtsam.NonlinearFactorGraph(), list[int]()
-        if not self.measured:
-            return emptied, graph
         self._join()
         keys, state = keys_of(values), State.of(values)
         self._new = []
