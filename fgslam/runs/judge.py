@@ -39,8 +39,8 @@ from fgslam.evaluation.truth import sound_truth
 from fgslam.report.content import TextTable, read_metrics, write_json
 from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.config import load_config
-from fgslam.runs.export import results_folder
-from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE, RUN_MARKER, is_run_folder
+from fgslam.runs.export import log_of, results_folder
+from fgslam.runs.folder import METRICS_FILE, REPORT_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE
 from fgslam.runs.tables import JUDGED_COLUMNS, judged_tables
 from fgslam.runs.tasks.slam_map_entry import arrival_of
@@ -294,7 +294,9 @@ def _in_world_of(
 
 def _joint(run: tuple[Path, str] | None, truth: Any) -> Any:
     """NEES of motions by joint covariances, as the run judged them by this truth; else None."""
-    if run is None or isinstance(truth, Trajectory) or Path(truth) != run[0] / GROUND_TRUTH_FILE:
+    if run is None or isinstance(truth, Trajectory):
+        return None
+    if Path(truth).resolve() != log_of(run[0]).with_name(GROUND_TRUTH_FILE).resolve():
         return None
     return value_at(read_metrics(run[0] / METRICS_FILE), f"estimators.{run[1]}.nees_relative")
 
@@ -322,13 +324,12 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
         raise ConfigError(
             f"{name}: is no run of fgslam, which could be judged by itself; give --truth FILE"
         )
-    config, log = load_config(run[0] / RUN_MARKER), MeasurementLog.load(run[0] / LOG_FILE)
+    config, file = load_config(run[0] / RUN_MARKER), log_of(run[0])
     settings = next((one for one in config.estimators if one.title == run[1]), config.estimator)
+    log, arrival = MeasurementLog.load(file), arrival_of(file.parent)
     halves = []
     for half in (0, 1):
-        found = replay(
-            half_of(log, half), settings, config.frontend.ego_motion, arrival=arrival_of(run[0])
-        )
+        found = replay(half_of(log, half), settings, config.frontend.ego_motion, arrival=arrival)
         if found.failure:
             raise DatasetError(
                 f"{name}: half of its landmarks do not do: {found.failure}; give --truth FILE"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,23 @@ def test_halves_of_the_landmarks_judge_a_run_without_truth(run: Path) -> None:
     assert 0.2 < judged.table().loc["drive", "nees_pose"] < 3.0
     with pytest.raises(fg.errors.ConfigError, match="is no run of fgslam"):
         fg.judge(run / "ground_truth.tum")
+
+
+def test_an_estimator_of_a_comparison_is_judged_by_what_its_run_knows(
+    run: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    drive = tmp_path / "drive"
+    shutil.copytree(run, drive)
+    with units_in_this_process():
+        assert main(monkeypatch, "compare", drive, "--estimators", "isam2") == 0
+    metrics = json.loads((drive / "compare" / "metrics.json").read_text())
+    judged = fg.judge(drive / "compare" / "isam2", drive / "ground_truth.tum")
+    assert (
+        judged.values["isam2"]["nees_relative"] == metrics["estimators"]["isam2"]["nees_relative"]
+    )
+    halves = fg.judge(drive / "compare" / "isam2")
+    assert any("two halves of the landmarks" in note for note in halves.notes)
+    assert 0.2 < halves.table().loc["isam2", "nees_pose"] < 3.0
 
 
 def test_halves_share_no_landmark_and_lose_none(run: Path) -> None:
