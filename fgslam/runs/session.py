@@ -507,8 +507,9 @@ class Slam(Session):
         Those of the right image where a landmark begins, of images (height, width, 3).
         """
         step = super().track(t, images, odometry)
-        shown = [image for image in images or () if image is not None]
-        if len(shown) == self.rig.cameras and np.ndim(shown[1]) == 3 and len(self.recorder):
+        shown = [] if images is None else [image for image in images if image is not None]
+        coloured = len(shown) == self.rig.cameras and np.shape(shown[1])[2:] in _CHANNELS
+        if coloured and len(self.recorder):
             seen = self.recorder.log.increments[-1].observations
             new = seen.select(seen.is_new)
             left, right, *top = map(_eight_bits, shown)
@@ -533,6 +534,9 @@ class Slam(Session):
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         values["notes"] = tuple(map(sentence, found.notes))
         return Result(**values, map=Map(saved, points, self._remark))
+
+
+_CHANNELS = ((3,), (4,))  # of images in colour
 
 
 def _eight_bits(image: npt.ArrayLike) -> Image:

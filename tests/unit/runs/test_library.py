@@ -15,6 +15,8 @@ from recordings import write_recording
 import fgslam as fg
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.cameras.rectify import Rectifier
+from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Prediction
 from fgslam.errors import (
     CalibrationError,
@@ -378,6 +380,24 @@ def test_landmarks_have_the_colours_of_the_images_that_began_them(folder: Path, 
     assert (grey == grey[:, :1]).all()
     for slam in (plain, coloured):
         slam.close()
+
+
+def test_images_in_one_array_or_with_one_channel_are_as_good_as_a_tuple(folder: Path) -> None:
+    recording = fg.open_recording(folder)
+    _, images, _ = next(iter(recording))
+    assert images is not None
+    rows, columns = np.indices(images[0].shape, np.float32)
+    raw = Rectifier(recording.rig, ((columns, rows),) * recording.rig.cameras)
+    values = {name: getattr(recording.rig, name) for name in CameraRig.__dataclass_fields__}
+    found = []
+    for given in (images, np.stack(images), [image[:, :, None] for image in images]):
+        with fg.Slam(fg.StereoRig(**values, rectifier=raw), "landmark_kalman") as slam:
+            slam.track(0.0, given)
+        found.append(slam.result().map)
+    assert len(found[0]) > 10
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.positions, found[0].positions)
+        np.testing.assert_array_equal(other.colours, found[0].colours)
 
 
 def test_a_map_is_saved_in_the_axes_of_ros(
