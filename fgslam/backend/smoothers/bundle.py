@@ -7,6 +7,7 @@ odometry, floor, loops, what is known of single landmarks) stay GTSAM's, which l
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
@@ -480,7 +481,6 @@ def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
 
 
 PLAIN = KernelSettings("none")
-_NONE: IntArray = np.empty(0, np.int64)
 _SLOW = 0.3  # of the last step's gain: beyond, a kept system has become another
 _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
@@ -519,7 +519,7 @@ class WholeGraph:
 
     Attributes:
         pose_keys, landmark_keys: of the variables, ascending.
-        seen: the observations; None without any.
+        seen: the observations.
         weights: (k,) of the observations; 0: left out.
         rest: the other factors.
         kernel: around each observation.
@@ -527,7 +527,7 @@ class WholeGraph:
 
     pose_keys: list[int]
     landmark_keys: list[int]
-    seen: Sightings | None
+    seen: Sightings
     weights: FloatArray
     rest: OtherFactors
     kernel: KernelSettings
@@ -550,10 +550,10 @@ class WholeGraph:
             measured: those of other sensors.
         """
         keys = poses, landmarks = keys_of(values)
-        found = seen.at_rows(*keys) if len(seen) else None
         more = tuple(one.at_rows(*keys) for one in measured)
         rest = OtherFactors(others, poses, landmarks, measured=more)
-        graph = WholeGraph(poses, landmarks, found, np.ones(len(seen)), rest, kernel)
+        weights = np.ones(len(seen))
+        graph = WholeGraph(poses, landmarks, seen.at_rows(*keys), weights, rest, kernel)
         return graph, State.of(values)
 
     def with_turns(
@@ -586,8 +586,8 @@ class WholeGraph:
         left = dataclasses.replace(
             self,
             landmark_keys=[key for key in self.landmark_keys if key not in gone],
-            seen=self.seen and self.seen.of_points(kept),
-            weights=self.weights[kept[self._points]],
+            seen=self.seen.of_points(kept),
+            weights=self.weights[kept[self.seen.points]],
             rest=self.rest.without(gone),
         )
         return left, dataclasses.replace(state, points=state.points[kept])
@@ -598,7 +598,7 @@ class WholeGraph:
 
     def unseen(self) -> IntArray:
         """Rows of the landmarks of which no observation counts."""
-        seen = [self._points[self.weights > 0.0], *(one.points for one in self.rest.measured)]
+        seen = [self.seen.points[self.weights > 0.0], *(one.points for one in self.rest.measured)]
         return np.setdiff1d(np.arange(len(self.landmark_keys)), np.concatenate(seen))
 
     # -- at a state ------------------------------------------------------------------------------
@@ -610,8 +610,6 @@ class WholeGraph:
 
     def squared(self, state: State) -> FloatArray:
         """(k,) squared whitened residuals of the observations, without weights and kernel."""
-        if self.seen is None:
-            return np.empty(0)
         residuals = self.seen.residuals(state.poses, state.points)
         return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
 
@@ -624,8 +622,6 @@ class WholeGraph:
     def linear(self, state: State) -> LinearSystem:
         """Normal equations at a state, robust weights as they are there."""
         rest = self.rest.linear(state.poses, state.points, state.bias)
-        if self.seen is None:
-            return rest
         rows = self.seen.look(state.poses, state.points)
         squared = self.weights * np.einsum("ki,ki->k", rows.residual, rows.residual)
         weights = self.weights * kernel_weights(self.kernel.name, self.kernel.width, squared)
@@ -644,8 +640,6 @@ class WholeGraph:
             Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
         """
         seen = self.seen
-        if seen is None:
-            raise ValueError("without observations there is nothing to shift")
         rows, parts = seen.look(state.poses, state.points), []
         for few in np.array_split(np.arange(len(seen)), len(seen) // _AT_ONCE + 1):
             by = -seen.roots[few] @ shifts(seen.measured[few])
@@ -691,15 +685,8 @@ class WholeGraph:
     # -- its parts -------------------------------------------------------------------------------
 
     @cached_property
-    def _points(self) -> IntArray:
-        """(k,) rows of the observations' landmarks."""
-        return _NONE if self.seen is None else self.seen.points
-
-    @cached_property
     def _incidence(self) -> tuple[csr_matrix, csr_matrix]:
         """Of the observations."""
-        if self.seen is None:
-            raise ValueError("no observations")
         return self.seen.incidence(len(self.pose_keys), len(self.landmark_keys))
 
 
@@ -775,5 +762,5 @@ def keys_of(values: Any) -> tuple[list[int], list[int]]:
 
 def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:
     """Sums (g, ...) of what each observation (k, ...) adds to its group, one after another."""
-    found = incidence @ each.reshape(len(each), -1)
+    found = incidence @ each.reshape(len(each), math.prod(each.shape[1:]))
     return np.asarray(found.reshape(-1, *each.shape[1:]))

@@ -115,8 +115,6 @@ def power_ratio(graph: WholeGraph, state: State) -> float:
 
     Tracks are as :class:`~fgslam.backend.persistence.Persistence` judges them.
     """
-    if graph.seen is None:
-        return 1.0
     frame_of = np.array([number(key) for key in graph.pose_keys])
     order, tracks = _in_tracks(graph.seen.points, frame_of[graph.seen.poses], graph.weights > 0.0)
     if not len(order):
@@ -296,7 +294,7 @@ class Refined:
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
-        if self.uncertain_rig is not None and self.graph.seen is not None:
+        if self.uncertain_rig is not None and len(self.graph.seen):
             return with_uncertain_rig(self.graph, self.state, self.uncertain_rig)
         return reduced(self.graph.linear(self.state))
 

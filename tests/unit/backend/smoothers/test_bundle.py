@@ -90,6 +90,20 @@ def test_cost_and_gradient_are_those_of_the_factors(name: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
+def test_without_any_landmark_the_other_factors_are_left() -> None:
+    _, values, builder = problem("none")
+    whole, state = builder.whole_graph(values)
+    both = dataclasses.replace(whole.rest, measured=(whole.seen,))
+    every = np.arange(len(whole.landmark_keys))
+    left, there = dataclasses.replace(whole, rest=both).without(every, state)
+    alone = dataclasses.replace(left.rest, measured=())
+    parts = there.poses, there.points, there.bias
+    assert left.cost(there) == alone.cost(*parts) > 0.0
+    system, expected = left.linear(there), alone.linear(*parts)
+    np.testing.assert_array_equal(system.pose_gradient, expected.pose_gradient)
+    np.testing.assert_array_equal(system.poses.toarray(), expected.poses.toarray())
+
+
 @pytest.mark.parametrize("name", ["none", "cauchy", "geman_mcclure"])
 def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str) -> None:
     graph, values, builder = problem(name)
