@@ -104,7 +104,6 @@ class Single:
     ``drift`` (6, 6) is the covariance of that pose, as a motion of the world.
     """
 
-    identity: int
     kind: str
     wTs: FloatArray
     drift: FloatArray
@@ -115,11 +114,12 @@ class Single:
 class Waiting:
     """Measurements of landmarks that have no place yet."""
 
-    _singles: Kept[list[Single]]
+    _singles: Kept[dict[int, list[Single]]]
 
     def __init__(self) -> None:
         """None yet."""
-        self._singles = []
+        self._singles = {}
+        """By the landmarks' identities."""
         self._models: dict[str, Any] = {}
 
     def begin(self, rig: CameraRig, one: Measured, pose: Prediction, held: IntArray) -> Begun:
@@ -131,7 +131,8 @@ class Waiting:
         if start is None:
             return self._fixed(new, pose, xTs)
         points, known = start
-        self._singles = [s for s in self._singles if s.identity not in new.ids]
+        for identity in new.ids.tolist():
+            self._singles.pop(identity, None)
         later = new.select(np.full(len(new), known is not None))
         if known is None:
             known = congruence(np.linalg.inv(one.model.jacobian(points)), new.covariance)
@@ -142,23 +143,23 @@ class Waiting:
         """Those that all their measurements so far fix."""
         wTs, drift = pose.wTc @ xTs, congruence(adjoint(pose.wTc), pose.covariance)
         each = zip(new.ids.tolist(), new.values, new.covariance, strict=True)
-        singles = [
-            Single(identity, new.kind, wTs, drift, *measured) for identity, *measured in each
-        ]
-        found = {single.identity: self._found(single) for single in singles}
+        found = {
+            identity: self._found(identity, Single(new.kind, wTs, drift, *measured))
+            for identity, *measured in each
+        }
         places = {identity: place for identity, place in found.items() if place is not None}
-        self._singles = [s for s in self._singles if s.identity not in places]
+        for identity in places:
+            del self._singles[identity]
         points = np.array([point for point, _ in places.values()]).reshape(-1, 3)
         known = np.array([covariance for _, covariance in places.values()]).reshape(-1, 3, 3)
         turned = congruence(pose.wTc[:3, :3].T, known)
         ids = np.array(list(places), np.int64)
         return Begun(ids, transform_to_camera(pose.wTc, points), turned, new.select(ids[:0]))
 
-    def _found(self, new: Single) -> tuple[FloatArray, FloatArray] | None:
+    def _found(self, identity: int, new: Single) -> tuple[FloatArray, FloatArray] | None:
         """The world point that a landmark's measurements fix, with one more; its covariance."""
-        own = [*(s for s in self._singles if s.identity == new.identity), new]
-        kept = own if len(own) < _LOOKED_FOR[-1] else own[::2]
-        self._singles = [s for s in self._singles if s.identity != new.identity] + kept
+        own = [*self._singles.get(identity, []), new]
+        self._singles[identity] = own if len(own) < _LOOKED_FOR[-1] else own[::2]
         known = all(single.kind in self._models for single in own)
         return fixed_point(own, self._models) if len(own) in _LOOKED_FOR and known else None
 
@@ -182,12 +183,8 @@ def fixed_point(
         groups.append((models[kind], len(own), *columns, drifts))
 
     def linear(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        n, hessian, gradient = (
-            len(points),
-            np.zeros((len(points), 3, 3)),
-            np.zeros((len(points), 3)),
-        )
-        cost = np.zeros(n)
+        n = len(points)
+        hessian, gradient, cost = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
         for model, k, *columns in groups:
             wTs, values, noise, drift = (np.concatenate([c] * n) for c in columns)
             rows = linearise(model, wTs, np.repeat(points, k, axis=0), values)
