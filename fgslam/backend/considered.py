@@ -300,11 +300,11 @@ class ConsiderCovariance(ErrorColumns):
 
     def motions(self, wTc: FloatArray) -> dict[int, FloatArray]:
         """(6, 6) what they add to the covariances of the motions over LAGS frames to it."""
-        root = self._terms.deviations
-        if root is None:
+        covariance = self._terms.covariance
+        if covariance is None:
             return {}
         motions = self.columns_of_motions(wTc).items()
-        return {lag: congruence(columns, root @ root.T) for lag, columns in motions}
+        return {lag: congruence(columns, covariance) for lag, columns in motions}
 
     def pose(self, newest: Prediction) -> Prediction:
         """The newest pose with what the terms add to its covariance."""
