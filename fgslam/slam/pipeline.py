@@ -107,27 +107,25 @@ class SlamPipeline:
         landmarks = self._current_map()
         step = self.witnesses.widened(odometry)
         around = prediction if step is odometry else predicted(self.estimator, step)
-        carried = self._track_patches(around, frame, landmarks)  # between key frames
+        now = Frame(index, odometry, prediction, step, around, landmarks, StereoFeatures.empty())
+        carried = self._track_patches(now, frame)  # between key frames
         frame = self._check_cameras(frame, index, body, carried)  # late, frozen, swapped: not used
         if frame.refused and self.key_frames is not None:
             put_back(*before[-1])
             carried = None
-        if self.key_frames and carried and self._needs_no_features(carried, odometry, prediction):
-            stereo, features, odometry = carried.carried.features, None, step
-            matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
+        if self.key_frames and carried and self._needs_no_features(carried, now):
+            stereo, features = carried.carried.features, None
+            matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried), step)
         else:
             frame = self._find_features(frame, carried, before)  # 2.1
             every = self._match_stereo(frame)  # 2.2
-            every, matched = self._track(
-                Frame(index, odometry, prediction, landmarks, every), frame, carried, step, around
-            )
-            odometry = matched.odometry
+            every, matched = self._track(now._replace(features=every), frame, carried)
             stereo = features = every.whole
             matched = self._recognise_places(matched, stereo, landmarks)
         matched = self._end_landmarks(matched)
-        increment = self._increment(index, timestamp, odometry, matched)  # what the log holds
+        increment = self._increment(index, timestamp, matched)  # what the log holds
         stats, noise = self._update(increment, matched.ego_motion)  # 6.4
-        if features is not None and not _known(odometry):
+        if features is not None and not _known(matched.odometry):
             self._look_for_other_motion(index, features, matched, stats)
         self._calibrate(increment, stats)
         mixed = stats.covariance + self.witnesses.open_covariance(stats.wTc)
@@ -193,22 +191,18 @@ class SlamPipeline:
         return landmarks.without(self._ended) if len(self._ended) else landmarks
 
     @timed("track")
-    def _track_patches(
-        self, prediction: Prediction, frame: FeatureFrame, landmarks: LandmarkMap
-    ) -> CarriedFrame | None:
+    def _track_patches(self, now: Frame, frame: FeatureFrame) -> CarriedFrame | None:
         """The frame by the landmarks whose patches are tracked into it; None where none are."""
         if self.key_frames is None or frame.frame is None or frame.frame.alone is not None:
             return None
-        return self.key_frames.carry(prediction, landmarks, frame.frame.images, self._correction())
+        images, correction = frame.frame.images, self._correction()
+        return self.key_frames.carry(now.around, now.landmarks, images, correction)
 
-    def _needs_no_features(
-        self, carried: CarriedFrame, odometry: Odometry | None, prediction: Prediction
-    ) -> bool:
+    def _needs_no_features(self, carried: CarriedFrame, now: Frame) -> bool:
         """Whether enough patches are tracked, none contradicts, and no place is looked for."""
         if not carried.suffices or (self.places is not None and self.places.wants_features):
             return False
-        pose = carried.tracked.ego_motion
-        return not self.witnesses.contradicts(odometry, prediction, pose)
+        return not self.witnesses.contradicts(now, carried.tracked.ego_motion)
 
     @timed("sift")
     def _find_features(
@@ -242,24 +236,16 @@ class SlamPipeline:
 
     @timed("track")
     def _track(
-        self,
-        now: Frame,
-        frame: FeatureFrame,
-        carried: CarriedFrame | None,
-        step: Odometry | None,
-        prediction: Prediction,
+        self, now: Frame, frame: FeatureFrame, carried: CarriedFrame | None
     ) -> tuple[StereoFeatures, Matched]:
-        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3).
-
-        Looked for around the prediction of ``step``, the odometry as uncertain as it errs.
-        """
-        landmarks, stereo = now.landmarks, now.features
+        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
+        prediction, landmarks, stereo = now.around, now.landmarks, now.features
         if frame.frame is None or frame.frame.alone is not None:
             if by_one := self._track_alone(now, frame):
                 return stereo, by_one
             status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
             blind = self.tracker.track_blind(prediction, status)
-            return stereo, Matched(blind, Association.nothing(), step)
+            return stereo, Matched(blind, Association.nothing(), now.taken)
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
@@ -300,8 +286,7 @@ class SlamPipeline:
         seen = self.stereo.alone(camera, frame.features[0], self._correction())
         tracked, as_rig = self.tracker.track_alone(camera, now.prediction, now.landmarks, seen)
         pose = tracked.ego_motion
-        contradicted = self.witnesses.contradicts(now.odometry, now.prediction, pose)
-        if contradicted or not pose.status.measured:
+        if self.witnesses.contradicts(now, pose) or not pose.status.measured:
             return None
         return Matched(pose, self.tracker.associate_carried(tracked, as_rig), now.odometry)
 
@@ -325,14 +310,12 @@ class SlamPipeline:
         association = dataclasses.replace(matched.association, pruned_ids=pruned)
         return dataclasses.replace(matched, association=association)
 
-    def _increment(
-        self, index: int, timestamp: float, odometry: Odometry | None, matched: Matched
-    ) -> Increment:
+    def _increment(self, index: int, timestamp: float, matched: Matched) -> Increment:
         association, calibration = matched.association, self.calibration
         return Increment(
             index=index,
             timestamp=timestamp,
-            odometry=odometry,
+            odometry=matched.odometry,
             observations=association.observations,
             rejected=association.rejected,
             missed_ids=association.missed_ids,
@@ -415,7 +398,7 @@ class Matched:
 
     ego_motion: EgoMotion
     association: Association
-    odometry: Odometry | None = None
+    odometry: Odometry | None
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
 

@@ -107,15 +107,14 @@ class Witnesses:
 
     # -- one frame -----------------------------------------------------------------------------
 
-    def contradicts(
-        self, step: Odometry | None, prediction: Prediction, tracking: EgoMotion
-    ) -> bool:
+    def contradicts(self, frame: Frame, tracking: EgoMotion) -> bool:
         """Whether odometry contradicts a pose; while its own chain lies elsewhere, it may."""
+        step = frame.odometry
         if step is None or not step.measured or not self._follows_images:
             return False
         if self._other is not None or tracking.status is EgoMotionStatus.CAPPED:
             return True
-        return self._squared(step, prediction, tracking) > _GATE
+        return self._squared(step, frame.prediction, tracking) > _GATE
 
     def widened(self, odometry: Odometry | None) -> Odometry | None:
         """Odometry, as uncertain as it errs while images are decided to be right.
@@ -140,7 +139,7 @@ class Witnesses:
         self._judged = True
         body = self._body_in(frame.features)
         tracked = _beginning_none(tracked, body)
-        agreed = Judged(tracked, "agreed", self.widened(frame.odometry))
+        agreed = Judged(tracked, "agreed", frame.taken)
         found, here = tracked.ego_motion, self._other
         # What was cut off its correction is the contradiction.
         free = found.status is EgoMotionStatus.CAPPED
@@ -617,6 +616,8 @@ class Frame(NamedTuple):
         number: in its recording.
         odometry: the camera's motion since the last frame; None where nothing gives it.
         prediction: pose by it.
+        taken: the same motion, as uncertain as it errs (:meth:`Witnesses.widened`).
+        around: pose by that, around which landmarks are looked for.
         landmarks: the map.
         features: all of the frame's.
     """
@@ -624,6 +625,8 @@ class Frame(NamedTuple):
     number: int
     odometry: Odometry | None
     prediction: Prediction
+    taken: Odometry | None
+    around: Prediction
     landmarks: LandmarkMap
     features: StereoFeatures
 
