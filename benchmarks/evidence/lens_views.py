@@ -27,7 +27,7 @@ from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, PoseFrame
 from fgslam.core.types import Trajectory
 from fgslam.datasets.rendered import RENDER_VERSION, RenderedLabSequence
-from fgslam.worlds.lab import PlaceChoice, Room, World, camera_offsets, open_room
+from fgslam.worlds.lab import PlaceChoice, Room, World, open_room
 from fgslam.worlds.renderer import RenderCache, Renderer, apply_effects, content_hash, omni_view
 from fgslam.worlds.settings import RenderedLabSettings
 
@@ -64,7 +64,7 @@ def raw_cameras(rig: CameraRig, lenses: Sequence[LensSettings] = LENSES) -> tupl
     names = ("right", "left", "top")
     return tuple(
         _raw_camera(rig, offset, lens, name)
-        for offset, lens, name in zip(camera_offsets(rig), lenses, names, strict=False)
+        for offset, lens, name in zip(rig.camera_poses, lenses, names, strict=False)
     )
 
 
@@ -118,7 +118,7 @@ class _ThroughPinholes:
     """Images that are rectified as they are."""
 
     def __init__(self, rig: CameraRig, room: Room) -> None:
-        self._world, self._poses = World(rig, room), [rig.bTc @ o for o in camera_offsets(rig)]
+        self._world, self._poses = World(rig, room), [rig.bTc @ o for o in rig.camera_poses]
 
     def images(self, wTb: FloatArray) -> FloatArray:
         """Grey levels (cameras, h, w)."""

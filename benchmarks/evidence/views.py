@@ -15,7 +15,7 @@ from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds.driving import simulate_wheels
-from fgslam.worlds.lab import PlaceChoice, World, camera_offsets, open_room
+from fgslam.worlds.lab import PlaceChoice, World, open_room
 from fgslam.worlds.renderer import apply_effects
 from fgslam.worlds.settings import RenderedLabSettings
 
@@ -48,9 +48,7 @@ class LabViews:
 
     def look(self, wTc: FloatArray, number: int) -> View:
         """Renders and finds features; ``number`` selects the image noise."""
-        clean = np.array(
-            [self._world.image(wTc @ offset, []) for offset in camera_offsets(self.rig)]
-        )
+        clean = np.array([self._world.image(wTc @ offset, []) for offset in self.rig.camera_poses])
         rounded = np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         images = apply_effects(rounded, self.settings.effects, number, self.seed)
         frame = Frame(number, float(number), images)

@@ -323,6 +323,15 @@ class CameraRig(Brief):
         """Number of cameras, 2 or 3."""
         return 2 if self.vertical_baseline is None else 3
 
+    @property
+    def camera_poses(self) -> FloatArray:
+        """(cameras, 4, 4) poses of right, left[, top] camera in the reference camera's frame."""
+        out = np.tile(np.eye(4), (self.cameras, 1, 1))
+        out[1, 0, 3] = -self.baseline
+        if self.vertical_baseline is not None:
+            out[2, 1, 3] = -self.vertical_baseline
+        return out
+
     def fTc(self, frame: PoseFrame) -> FloatArray:
         """(4, 4) pose of the reference camera in another frame. ConfigError: no such frame."""
         if frame == "body":

@@ -25,7 +25,6 @@ from fgslam.worlds.lab import (
     PlaceChoice,
     Room,
     World,
-    camera_offsets,
     first_pose,
     identity_values,
     make_rig,
@@ -269,7 +268,7 @@ class RenderedLabSequence:
         world = self._open_world()
         pose = self._body[index] @ self._rig.bTc
         bodies = self._bodies(world, index)
-        images = [world.image(pose @ offset, bodies) for offset in camera_offsets(self._rig)]
+        images = [world.image(pose @ offset, bodies) for offset in self._rig.camera_poses]
         return np.clip(np.rint(images), 0, 255).astype(np.uint8)
 
     def _bodies(self, world: World, index: int) -> list[Body]:

@@ -546,9 +546,6 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
     image, ids, pixels = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
     used, point = np.unique(ids, return_inverse=True)
     of_map, order = np.searchsorted(points.ids, used), np.lexsort((point, image))
-    steps = np.array([[0, 0], [-rig.baseline, 0], [0, -(rig.vertical_baseline or 0.0)]])
-    cameras = np.tile(np.eye(4), (rig.cameras, 1, 1))
-    cameras[:, :2, 3] = steps[: rig.cameras]
     return ImageModel(
         rig=rig,
         names=tuple(
@@ -556,7 +553,7 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
             for row in range(len(trajectory))
             for camera in CAMERA_NAMES[: rig.cameras]
         ),
-        poses=(trajectory.poses[:, None] @ cameras).reshape(-1, 4, 4),
+        poses=(trajectory.poses[:, None] @ rig.camera_poses).reshape(-1, 4, 4),
         ids=used,
         positions=points.positions[of_map],
         colours=points.colours[of_map],

@@ -235,14 +235,6 @@ def make_rig(settings: LabRigSettings) -> CameraRig:
     )
 
 
-def camera_offsets(rig: CameraRig) -> list[FloatArray]:
-    """Poses (4, 4) of right, left[, top] camera in the reference camera's frame."""
-    offsets = [(0.0, 0.0, 0.0), (-rig.baseline, 0.0, 0.0)]
-    if rig.vertical_baseline is not None:
-        offsets.append((0.0, -rig.vertical_baseline, 0.0))
-    return [geometry.pose(np.eye(3), np.array(offset)) for offset in offsets]
-
-
 class Room:
     """A furnished place with its light and textures, as at one visit; the same for every rig.
 

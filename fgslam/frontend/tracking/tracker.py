@@ -13,7 +13,6 @@ from fgslam.core.geometry import (
     compose_covariance,
     in_front,
     inverse,
-    pose,
     rotate_covariances,
     transform_to_camera,
     transform_to_world,
@@ -278,8 +277,7 @@ class LandmarkTracker:
             found: features of that image (:meth:`StereoMatcher.alone`).
         """
         rig = self.rig
-        offset = np.array([[0, 0, 0], [-rig.baseline, 0, 0], [0, -(rig.vertical_baseline or 0), 0]])
-        cTo, exact = pose(np.eye(3), offset[camera]), np.zeros((6, 6))
+        cTo, exact = rig.camera_poses[camera], np.zeros((6, 6))
         spread = compose_covariance(cTo, prediction.covariance, exact)
         tracked = self.track(Prediction(prediction.wTc @ cTo, spread), landmarks, found)
         found_pose = tracked.ego_motion

@@ -34,7 +34,6 @@ from fgslam.report.content import sentence
 from fgslam.worlds.lab import (
     PlaceChoice,
     World,
-    camera_offsets,
     make_rig,
     open_room,
     plan_in_place,
@@ -192,7 +191,7 @@ def test_steps_as_long_as_the_baseline_are_no_lag(yaw: float) -> None:
     frames = []
     for k in range(8):
         wTc = body @ rig.bTc @ pose(np.eye(3), np.array([0.1 * (k - 4), 0.0, 0.0]))
-        both = [world.image(wTc @ offset, []) for offset in camera_offsets(rig)]
+        both = [world.image(wTc @ offset, []) for offset in rig.camera_poses]
         frames.append(tuple(noisy(np.asarray(image), k) for image in both))
     watch = CameraWatch(rig)
     assert not any(watch.look(images) for images in frames)
