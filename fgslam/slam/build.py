@@ -580,7 +580,5 @@ def evidence_of(pipeline: SlamPipeline, recorder: RunRecorder, before: SavedMap 
 
     Those of the map that it began in count, too; a map that is only localised in takes in nothing.
     """
-    own = np.array([d for d in recorder.frame_digests if d], np.int64)
-    if pipeline.tracker.keeps_map:
-        own = own[:0]
-    return np.unique(own) if before is None else np.union1d(before.evidence, own)
+    own = recorder.seen[:0] if pipeline.tracker.keeps_map else recorder.seen
+    return own if before is None else np.union1d(before.evidence, own)

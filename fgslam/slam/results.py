@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import WeighedCorrection
-from fgslam.core.arrays import BoolArray, Brief, FloatArray
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Observations
@@ -108,6 +108,11 @@ class RunRecorder:
         """Each pose as it was first estimated, at its own time."""
         poses = np.array(self.online_poses).reshape(-1, 4, 4)
         return Trajectory(self.log.timestamps, poses)
+
+    @property
+    def seen(self) -> IntArray:
+        """(f,) digests of the frames with images, ascending."""
+        return np.unique(np.array([d for d in self.frame_digests if d], np.int64))
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """One number of all frames."""
@@ -300,7 +305,7 @@ def result_of(
         online_covariances=covariances,
         closed=() if pipeline.places is None else tuple(pipeline.places.taken),
         frames=_columns(recorder)
-        | {"connected": pipeline.tracker.parts.connected[: len(recorder)]},
+        | {"connected": connected_frames(recorder, pipeline.tracker.parts)},
         notes=notes,
         rig=None if pipeline.calibration is None else pipeline.calibration.found,
     )

@@ -362,8 +362,7 @@ class Session:
     def remembered(self, memory: RigMemory) -> RigMemory:
         """A memory of the rig with what this drive has shown; as it is where that is nothing."""
         calibration = self.pipeline.calibration
-        seen = np.array([d for d in self.recorder.frame_digests if d], np.int64)
-        return memory if calibration is None else memory.after(calibration, seen)
+        return memory if calibration is None else memory.after(calibration, self.recorder.seen)
 
     @property
     def failed(self) -> bool:
