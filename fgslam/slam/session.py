@@ -417,16 +417,17 @@ def _completed(
 ) -> tuple[Sequence[npt.ArrayLike] | None, int | None]:
     """Images with black ones in place of missing ones, and the camera whose image is left.
 
-    None for images that are all missing; no camera where none is.
+    None for images that are all missing; no camera where none is, or their number is wrong.
     """
-    if not isinstance(images, tuple | list) or not any(one is None for one in images):
+    missing = isinstance(images, tuple | list) and any(one is None for one in images)
+    if images is None or not missing or len(images) != rig.cameras:
         return cast("Sequence[npt.ArrayLike] | None", images), None
-    there = [k for k in (1, 0, 2)[: len(images)] if images[k] is not None]
+    # The rig's order is right, left, top.
+    there = [k for k, one in zip((1, 0, 2), images, strict=False) if one is not None]
     if not there:
         return None, None
     black = np.zeros(_size(rig)[::-1], np.uint8)
-    full = [black if one is None else one for one in images]
-    return full, (1, 0, 2)[there[0]]  # the rig's order is right, left, top
+    return [black if one is None else one for one in images], min(there)
 
 
 def checked_images(images: Sequence[npt.ArrayLike], rig: CameraRig) -> tuple[Image, ...]:

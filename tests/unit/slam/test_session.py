@@ -300,6 +300,7 @@ WRONG: dict[str, tuple[type[FgslamError], str, dict[str, Any]]] = {
     "images are a generator": (FrameError, "generator", {"images": lambda v: (x for x in v)}),
     "rows differ": (FrameError, "different lengths", {"images": lambda v: ([[1, 2], [3]], *v[1:])}),
     "one image": (FrameError, "1 images given", {"images": lambda v: v[:1]}),
+    "one missing": (FrameError, "1 images given", {"images": lambda v: [None]}),
     "two images": (FrameError, "without vertical_baseline", {"images": lambda v: v[:2]}),
     "half size": (FrameError, "160x120", {"images": lambda v: tuple(x[::2, ::2] for x in v)}),
     "float images": (FrameError, "float64", {"images": lambda v: tuple(x / 255.0 for x in v)}),
