@@ -53,6 +53,11 @@ class FeatureFrame:
     sift_ms: float
     refused: bool = False
 
+    @property
+    def whole(self) -> Frame | None:
+        """The frame, where the images of all cameras are to be used; else None."""
+        return None if self.frame is None or self.frame.alone is not None else self.frame
+
 
 class FeatureExtractor(Protocol):
     """Finds the features of an image: an extension point, any callable of this form will do.

@@ -150,11 +150,11 @@ class SlamPipeline:
         carried: CarriedFrame | None = None,
     ) -> FeatureFrame:
         """The frame; of images not of one moment and this one, that of one camera, or none."""
-        if self.watch is None or frame.frame is None or frame.frame.alone is not None:
+        if self.watch is None or (whole := frame.whole) is None:
             return frame
         seen = carried.carried if carried else Carried.nothing()
         tracked = seen.before, seen.features.pixels
-        fault = self.watch.look(frame.frame.images, index, has_moved(body), tracked)
+        fault = self.watch.look(whole.images, index, has_moved(body), tracked)
         if not fault:
             return frame
         alone = self.watch.alone
@@ -162,7 +162,7 @@ class SlamPipeline:
             return dataclasses.replace(frame, frame=None, features=(), problem=fault, refused=True)
         return dataclasses.replace(
             frame,
-            frame=dataclasses.replace(frame.frame, alone=alone),
+            frame=dataclasses.replace(whole, alone=alone),
             features=frame.features[alone : alone + 1],
             problem=f"{fault} (the {CAMERA_NAMES[alone]} image alone is left)",
             refused=True,
@@ -193,10 +193,10 @@ class SlamPipeline:
     @timed("track")
     def _track_patches(self, now: Frame, frame: FeatureFrame) -> CarriedFrame | None:
         """The frame by the landmarks whose patches are tracked into it; None where none are."""
-        if self.key_frames is None or frame.frame is None or frame.frame.alone is not None:
+        whole, correction = frame.whole, self._correction()
+        if self.key_frames is None or whole is None:
             return None
-        images, correction = frame.frame.images, self._correction()
-        return self.key_frames.carry(now.around, now.landmarks, images, correction)
+        return self.key_frames.carry(now.around, now.landmarks, whole.images, correction)
 
     def _needs_no_features(self, carried: CarriedFrame, now: Frame) -> bool:
         """Whether enough patches are tracked, none contradicts, and no place is looked for."""
@@ -227,7 +227,7 @@ class SlamPipeline:
 
     @timed("stereo")
     def _match_stereo(self, frame: FeatureFrame) -> StereoFeatures:
-        if frame.frame is None or frame.frame.alone is not None:
+        if frame.whole is None:
             return StereoFeatures.empty()
         tried, self._tried = self._tried, None
         if tried and tried[0].frame is frame.frame and tried[0].features is frame.features:
@@ -240,7 +240,7 @@ class SlamPipeline:
     ) -> tuple[StereoFeatures, Matched]:
         """A key frame by all its features, those of tracked patches among them (3.1 to 4.3)."""
         prediction, landmarks, stereo = now.around, now.landmarks, now.features
-        if frame.frame is None or frame.frame.alone is not None:
+        if (whole := frame.whole) is None:
             if by_one := self._track_alone(now, frame):
                 return stereo, by_one
             status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
@@ -263,7 +263,7 @@ class SlamPipeline:
         judged = self.witnesses.judge(now._replace(features=stereo), tracked)
         tracked = judged.tracked
         relocalised = judged.by_images or (located and judged.verdict == "agreed")
-        image = frame.frame.images[0]
+        image = whole.images[0]
         if self.key_frames is not None:
             tracked = spread(tracked, stereo)
         association = self.tracker.associate(tracked, stereo, image, initialises, judged.settled)
@@ -369,7 +369,7 @@ class SlamPipeline:
 
         Not with images that the watch refuses: what they match is chance, or of two moments.
         """
-        if frame.frame is None or frame.frame.alone is not None:
+        if frame.whole is None:
             return False
         if self.watch is not None:
             before = snapshot(self.watch)

@@ -386,15 +386,13 @@ class FirstImages:
 
     def add(self, found: FeatureFrame, uint16: bool) -> None:
         """Counts a frame with features; ``uint16``: they were given so."""
-        if found.frame is None or not found.features or self._frames >= _FRAMES:
-            return
-        if found.frame.alone is not None:
+        if (whole := found.whole) is None or not found.features or self._frames >= _FRAMES:
             return
         self._frames += 1
         self._left += [len(own) for own in found.features[1:2]]
-        spread = [float(image.std()) for image in found.frame.images[:2]]
+        spread = [float(image.std()) for image in whole.images[:2]]
         self._spread = np.vstack([self._spread, spread])
-        self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
+        self._brightest = max(self._brightest, *(int(image.max()) for image in whole.images))
         self._uint16 |= uint16
 
     def left(self) -> str:
