@@ -504,7 +504,7 @@ class CameraWatch:
         images: tuple[Image, ...],
         number: int | None = None,
         moved: bool = False,
-        tracked: tuple[FloatArray, FloatArray] = (np.empty((0, 2)), np.empty((0, 3, 2))),
+        tracked: tuple[FloatArray, FloatArray] | None = None,
     ) -> str:
         """Takes in a frame; what is wrong with its images, in words; empty where nothing is.
 
@@ -517,8 +517,10 @@ class CameraWatch:
                 are looked for.
         """
         now, repeated = Shrunk(images, self._factor), self._repeated(images, moved)
-        seen = self._by_landmarks(now, *tracked) if not repeated else []
-        fault = "" if seen else self._by_corners(now, repeated, seen)
+        seen = self._by_landmarks(now, *tracked) if tracked and not repeated else []
+        fault = ""
+        if not seen:
+            fault, seen = self._by_corners(now, repeated)
         if not fault:
             self._turns.take(self._frames if number is None else number, seen)
         self._before, self._frames = now.images, self._frames + 1
@@ -541,9 +543,12 @@ class CameraWatch:
             self._weigh(pair, now.grey[0], now.grey[camera], *shown)
         return seen
 
-    def _by_corners(self, now: Shrunk, repeated: str, seen: list[LineRows]) -> str:
-        """As :meth:`look`, by corners that are followed across and in time; adds to ``seen``."""
-        swapped = ""
+    def _by_corners(self, now: Shrunk, repeated: str) -> tuple[str, list[LineRows]]:
+        """What is wrong, as :meth:`look`, by corners followed across and in time; and the corners.
+
+        Those of each other camera, where nothing is wrong.
+        """
+        swapped, seen = "", list[LineRows]()
         points = now.corners()
         across = [followed(now.images[0], other, points) for other in now.images[1:]]
         shown = np.logical_or.reduce([kept for _, kept in across])
@@ -568,7 +573,7 @@ class CameraWatch:
         fault = repeated or swapped or self._old()
         good = np.flatnonzero(~(np.array(self._late) | (self._same & bool(repeated))))
         self.alone = int(good[0]) if fault and not swapped and len(good) else None
-        return fault
+        return fault, seen
 
     @property
     def knocked(self) -> bool:

@@ -28,7 +28,7 @@ from fgslam.core.types import (
 from fgslam.frontend.camera_faults import CameraWatch
 from fgslam.frontend.stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import MatchNoise, unmeasured
-from fgslam.frontend.tracking.key_frames import Carried, CarriedFrame, KeyFrameTracker, spread
+from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
@@ -152,8 +152,9 @@ class SlamPipeline:
         """The frame; of images not of one moment and this one, that of one camera, or none."""
         if self.watch is None or (whole := frame.whole) is None:
             return frame
-        seen = carried.carried if carried else Carried.nothing()
-        tracked = seen.before, seen.features.pixels
+        tracked = None
+        if carried is not None:
+            tracked = carried.carried.before, carried.carried.features.pixels
         fault = self.watch.look(whole.images, index, has_moved(body), tracked)
         if not fault:
             return frame

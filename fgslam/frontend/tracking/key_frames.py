@@ -447,12 +447,6 @@ class Carried(Rows):
     before: FloatArray
     features: StereoFeatures
 
-    @staticmethod
-    def nothing() -> Carried:
-        """No landmark."""
-        none = np.empty(0, np.int64)
-        return Carried(none, none, np.empty((0, 2)), StereoFeatures.empty())
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points(Rows):

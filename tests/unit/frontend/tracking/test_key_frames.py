@@ -245,7 +245,8 @@ def frame(inliers: int, outliers: int, status: EgoMotionStatus = EgoMotionStatus
     used = np.arange(inliers + outliers) < inliers
     pose = EgoMotion(np.eye(4), np.eye(6), used, np.zeros(len(used)), status, 1)
     tracked: Any = SimpleNamespace(ego_motion=pose)
-    return CarriedFrame(Carried.nothing(), tracked, lasting=True)
+    carried: Any = None
+    return CarriedFrame(carried, tracked, lasting=True)
 
 
 @pytest.mark.parametrize(
