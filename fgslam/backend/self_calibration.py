@@ -105,7 +105,7 @@ class SelfCalibration:
         Args:
             rig: the cameras.
             pixel_sigma: of one coordinate, pixels.
-            begun: gives what earlier drives have shown (:mod:`fgslam.slam.rig_memory`).
+            begun: gives what earlier drives have shown; None: nothing.
         """
         self._unknowns = RigUnknowns(rig)
         self._begun = (begun or RigFilter.none)(self._unknowns)

@@ -425,7 +425,6 @@ class RigStereo:
         ``by_patches``: whether the latter is asked whatever images have features.
         """
         self.matcher = matcher
-        self.alone = matcher.alone
         self._patches = patches
         self._by_patches = by_patches
 

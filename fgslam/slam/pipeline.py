@@ -284,7 +284,7 @@ class SlamPipeline:
         if frame.frame is None or frame.frame.alone is None or not frame.features:
             return None
         camera = frame.frame.alone
-        seen = self.stereo.alone(camera, frame.features[0], self._correction())
+        seen = self.stereo.matcher.alone(camera, frame.features[0], self._correction())
         tracked, as_rig = self.tracker.track_alone(camera, now.prediction, now.landmarks, seen)
         pose = tracked.ego_motion
         if self.witnesses.contradicts(now, pose) or not pose.status.measured:

@@ -299,7 +299,7 @@ class LandmarkCarrier:
         costs nothing.
         """
         self._keep(~np.isin(self._points.ids, begun.points.ids))
-        self._last, self._fresh = self._stereo.fine(image), begun
+        self._last, self._fresh = self.fine(image), begun
 
     def forget(self, ids: IntArray) -> None:
         """Carries these no further."""
@@ -320,7 +320,7 @@ class LandmarkCarrier:
             expected: landmarks of the map where the predicted pose expects them.
             correction: of the rig; None where its calibration is taken as stated.
         """
-        last, now = self._last, self._stereo.fine(images[0])
+        last, now = self._last, self.fine(images[0])
         self._last = now
         self._keep(np.isin(self._points.ids, expected.ids))
         self._fresh = self._fresh.select(np.isin(self._fresh.points.ids, expected.ids))
@@ -340,14 +340,8 @@ class LandmarkCarrier:
         patches, places, good = self._in_reference(last, now, patches, predicted)
         pixels = [places]
         for camera in range(1, len(images)):
-            seen, alike = across(
-                self._rig,
-                self._stereo.fine(images[camera]),
-                camera,
-                patches,
-                places,
-                predicted[:, 2],
-            )
+            view = self.fine(images[camera])
+            seen, alike = across(self._rig, view, camera, patches, places, predicted[:, 2])
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
         views = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
