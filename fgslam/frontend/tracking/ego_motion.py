@@ -127,21 +127,30 @@ class EgoMotionSolver:
         robust: bool,
     ) -> _Minimum:
         """The pose from ``start``; not converged where the matches leave it undetermined."""
-        prior = np.zeros((6, 6))
-        if self._settings.prior:
-            prior = _prior_information(prediction.covariance)
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
         kernel = ROBUST.index(self._settings.kernel) if robust else 0
         system, state, predicted = np.zeros((2, 7, 6)), np.zeros(2), prediction.wTc
         moved = inverse(predicted) @ start
         fit_pose(
             transform_to_camera(predicted, problem.points), problem.measurement, information,
-            self._camera, prior, self.floor.basis(predicted), kernel, tolerance, MAX_ITERATIONS,
-            moved, system, state, np.zeros((7, 6, 6)),
+            self._camera, self._known(prediction), self.floor.basis(predicted), kernel, tolerance,
+            MAX_ITERATIONS, moved, system, state, np.zeros((7, 6, 6)),
         )  # fmt: skip
         wTc, hessian = predicted @ moved if state[1] else start, system[0, :6]
         found = bool(state[1]) and self._determined(wTc, hessian)
         return _Minimum(wTc, hessian, found, int(state[0]))
+
+    def _known(self, prediction: Prediction) -> FloatArray:
+        """Information (6, 6) of the prediction, where it has a say; else zeros.
+
+        A direction known exactly counts as known to a micrometre.
+        """
+        if not self._settings.prior:
+            return np.zeros((6, 6))
+        try:
+            return _inverse_spd(prediction.covariance)
+        except np.linalg.LinAlgError:
+            return _inverse_spd(prediction.covariance + _EXACT_SIGMA**2 * np.eye(6))
 
     def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
         """True if the matches (and the prior) determine all degrees of freedom."""
@@ -278,9 +287,7 @@ class EgoMotionSolver:
         points = transform_to_camera(wTc, problem.points)
         jacobian = self.sensor.jacobian(points) @ point_pose_jacobian(points)
         pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem, noise)
-        known = np.zeros((6, 6))
-        if self._settings.prior:
-            known = _prior_information(prediction.covariance)
+        known = self._known(prediction)
         hessian = (pull @ jacobian).sum(axis=0) + known
         covariance = self._covariance(wTc, hessian)
         return covariance @ known, covariance @ pull
@@ -288,14 +295,6 @@ class EgoMotionSolver:
 
 def _squared(residual: FloatArray, information: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ki,kij,kj->k", residual, information, residual))
-
-
-def _prior_information(covariance: FloatArray) -> FloatArray:
-    """Information of the prediction; a direction known exactly counts as known to a micrometre."""
-    try:
-        return _inverse_spd(covariance)
-    except np.linalg.LinAlgError:
-        return _inverse_spd(covariance + _EXACT_SIGMA**2 * np.eye(6))
 
 
 def _inverse_spd(matrix: FloatArray) -> FloatArray:
