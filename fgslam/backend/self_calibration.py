@@ -175,10 +175,8 @@ class SelfCalibration:
         information = self._known.information - left * self._begun.information
         return information, self._known.pull - left * self._begun.pull
 
-    def observe(
-        self, increment: Increment, wTc: FloatArray, passes: bool = False
-    ) -> WeighedCorrection:
-        """Takes in a frame as measured and its pose; returns the correction as known now.
+    def observe(self, increment: Increment, wTc: FloatArray, passes: bool = False) -> None:
+        """Takes in a frame as measured and its pose; ``found`` is then as known with it.
 
         ``passes``: something that moves is in view; the frame is no evidence.
         """
@@ -186,12 +184,11 @@ class SelfCalibration:
         if increment.relocalised or passes:
             self._frames.clear()
         if passes:
-            return self.found
+            return
         self._frames.append((wTc, increment.kept))
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []
             self._take(frames, increment.timestamp)
-        return self.found
 
     def _take(self, frames: list[tuple[FloatArray, Observations]], timestamp: float) -> None:
         since = 0.0 if self._last_time is None else timestamp - self._last_time
