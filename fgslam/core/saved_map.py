@@ -7,7 +7,7 @@ or not at all.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +152,8 @@ def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
     Raises:
         MapError: what differs first; ``where`` names the map.
     """
-    for name in (field.name for field in fields(CameraRig)[:8]):
-        theirs, ours = getattr(saved.rig, name), getattr(rig, name)
+    for name, ours in rig.numbers.items():
+        theirs = saved.rig.numbers[name]
         if (theirs is None) != (ours is None) or (
             ours is not None and not np.isclose(theirs, ours, rtol=_SAME_RIG, atol=0.0)
         ):

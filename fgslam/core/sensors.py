@@ -6,7 +6,7 @@ Derived in docs/derivations/measurements.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import lru_cache
 from typing import Any, Literal, TypeAlias, get_args
@@ -322,6 +322,11 @@ class CameraRig(Brief):
     def cameras(self) -> int:
         """Number of cameras, 2 or 3."""
         return 2 if self.vertical_baseline is None else 3
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Size, intrinsics and baselines, by name."""
+        return {one.name: getattr(self, one.name) for one in fields(CameraRig)[:8]}
 
     @property
     def camera_poses(self) -> FloatArray:

@@ -70,8 +70,7 @@ class RigMemory:
         ``rectifier``: what rectifies its images; None: the rig's own, if it has one.
         """
         rectifier = rectifier or getattr(rig, "rectifier", None)
-        names = [field.name for field in dataclasses.fields(CameraRig)[:8]]
-        content = [getattr(rig, name) for name in names]
+        content = list(rig.numbers.values())
         if rectifier is not None:
             raw = rectifier.calibration
             content += [rectifier.correction, () if raw is None else raw.cameras]
