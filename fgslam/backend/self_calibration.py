@@ -254,7 +254,7 @@ class SelfCalibration:
         )
         one = start.precision(of) + (before.information + after.information) / factor
         mixed = after.information[:p] / factor
-        own = mixed[:, :p] + prior_information(of.rig)
+        own = mixed[:, :p] + of.prior(start.field_px)[:p, :p]
         joint = np.block([[own, mixed], [mixed.T, one]])
         pull = np.append(after.pull[:p] / factor, start.pull + (before.pull + after.pull) / factor)
         covariance = np.asarray(np.linalg.inv(joint))
