@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial import polynomial
 
 from fgslam.cameras.lenses import RawCamera, checked_camera
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.files import read_text
 from fgslam.core.geometry import wrap
@@ -136,9 +135,6 @@ def inside(pixels: FloatArray, width: int, height: int) -> FloatArray:
 
 # --------------------------------------------------------------------------------------------
 # Where each pixel of one camera's image lies in another's, both at one viewpoint
-
-
-Float32 = npt.NDArray[np.float32]
 
 OUTSIDE = -1e4
 """Coordinate of pixels that the source does not see: outside any image, so that it stays black."""

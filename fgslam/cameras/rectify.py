@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.lenses import Calibration, RawCamera
-from fgslam.core.arrays import Brief, FloatArray, Image
+from fgslam.core.arrays import Brief, Float32, FloatArray, Image
 from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
@@ -114,7 +114,7 @@ class Rectifier(Brief):
         return np.asarray(seen & (found == 255))
 
     @cached_property
-    def margins(self) -> tuple[npt.NDArray[np.float32], ...]:
+    def margins(self) -> tuple[Float32, ...]:
         """Per camera, how far each pixel (h, w) is from what shows nothing; empty: all are full."""
         if all(mask.all() for mask in self.masks):
             return ()

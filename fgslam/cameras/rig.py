@@ -14,7 +14,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.cameras import formats
 from fgslam.cameras.calib_json import (
@@ -37,7 +36,7 @@ from fgslam.cameras.rectify import (
     rectifier_of,
 )
 from fgslam.cameras.trees import Size, Tree, is_camera_text, read_tree
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import as_path, read_text, shown_in
@@ -107,7 +106,7 @@ class StereoRig(CameraRig):
         return 1.0 if self.rectifier is None else self.rectifier.overlap
 
     @property
-    def margins(self) -> tuple[npt.NDArray[np.float32], ...]:
+    def margins(self) -> tuple[Float32, ...]:
         """Per camera, how far each rectified pixel is from what shows nothing; empty: all do."""
         return () if self.rectifier is None else self.rectifier.margins
 

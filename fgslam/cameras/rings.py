@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.cameras.omni import (
     PAPER_DEGREE,
@@ -17,10 +16,8 @@ from fgslam.cameras.omni import (
     RadialPolynomial,
     fit_radial_polynomial,
 )
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError
-
-Float32 = npt.NDArray[np.float32]
 
 _DIRECTIONS = 360
 _STEP_PX = 0.25

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
-from fgslam.core.arrays import Brief, FloatArray, Image, IntArray, Rows
+from fgslam.core.arrays import Brief, Float32, FloatArray, Image, IntArray, Rows
 from fgslam.core.checks import is_finite_number
 from fgslam.core.correction import term_names
 from fgslam.core.errors import DatasetError, MeasurementLogError
@@ -246,7 +245,7 @@ class Frame:
     index: int
     timestamp: float
     images: tuple[Image, ...]
-    margins: tuple[npt.NDArray[np.float32], ...] = ()
+    margins: tuple[Float32, ...] = ()
     alone: int | None = None
 
     def digest(self) -> int:
@@ -257,7 +256,7 @@ class Frame:
         return int.from_bytes(content.digest(), "little", signed=True)
 
 
-def clearance(margin: npt.NDArray[np.float32], places: FloatArray) -> FloatArray:
+def clearance(margin: Float32, places: FloatArray) -> FloatArray:
     """How far (n,) places (n, 2) (column, row) are from what shows nothing, pixels.
 
     Args:

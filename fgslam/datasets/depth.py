@@ -21,7 +21,7 @@ from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import View, pixel_grid, sampling_maps
 from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
 from fgslam.cameras.trees import intrinsic_matrix, read_tree
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_lines, shown_in
@@ -138,7 +138,7 @@ _LEAST_WEIGHT = 1e-3
 _SMOOTH = (41, 41)  # what fills the parts that nothing is known of has no texture of this size
 
 
-def seen_from_the_left(image: Image, shift: npt.NDArray[np.float32], known: BoolArray) -> Image:
+def seen_from_the_left(image: Image, shift: Float32, known: BoolArray) -> Image:
     """The image (h, w, ...) with each known pixel further right by its ``shift`` (h, w).
 
     Nearer surfaces hide farther ones. What is seen by neither is filled without texture.

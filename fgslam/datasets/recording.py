@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
-from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
+from fgslam.core.arrays import Brief, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, OneImageError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.log import Frame
@@ -80,7 +79,7 @@ class Recording(Brief):
     truth_frame: PoseFrame = "left"
     odometry_source: OdometrySource | None = None
     rectifier: Rectifier | None = None
-    margins: tuple[npt.NDArray[np.float32], ...] = ()
+    margins: tuple[Float32, ...] = ()
     disparity_sigma_px: float | None = None
     ledger: tuple[Entry, ...] = ()
     calibration: str = ""

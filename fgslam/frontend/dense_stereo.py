@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.correction import camera_displacements
 from fgslam.core.sensors import CameraRig, vertical_to_horizontal
 
-Float32: TypeAlias = npt.NDArray[np.float32]
 Int16: TypeAlias = npt.NDArray[np.int16]
 
 MIN_DISPARITY_PX = 4.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import ByteArray, Float32, FloatArray, IntArray
 from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
@@ -97,9 +97,9 @@ class CoarseColumns:
 
     bearing: npt.NDArray[np.int16]
     sigma_bearing: ByteArray
-    tangents: npt.NDArray[np.float32]
+    tangents: Float32
     sigma_tangents: ByteArray
-    descriptors: npt.NDArray[np.float32]
+    descriptors: Float32
 
     @staticmethod
     def of(segments: ColumnSegments) -> CoarseColumns:
@@ -155,7 +155,7 @@ def _of_bytes(codes: ByteArray) -> FloatArray:
     return np.asarray(_LEAST * np.exp(codes / _BYTE))
 
 
-def _shortened(values: FloatArray) -> npt.NDArray[np.float32]:
+def _shortened(values: FloatArray) -> Float32:
     """Values as float32 that end in zeros, which a file's compression takes away."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     half = np.uint32(1 << (_MANTISSA - 1))

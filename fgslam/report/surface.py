@@ -11,20 +11,18 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import OutputError
 from fgslam.core.files import write_bytes, write_text
 from fgslam.core.geometry import inverse, skew
 from fgslam.core.open3d_library import load_open3d
 from fgslam.report.formats import AXES, ROS_FROM_CAMERA, Axes, pcd_bytes, ply_bytes
-
-Float32: TypeAlias = npt.NDArray[np.float32]
 
 TRUNCATION_VOXELS = 4.0
 KEPT_SIGMA_VOXELS = 1.5

@@ -10,7 +10,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.correction import EXPECTED_PX, FIELD_PX, SHARED, shared_information
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.log import MeasurementLog
@@ -23,7 +23,6 @@ from fgslam.report.surface import (
     KEPT_SIGMA_VOXELS,
     TRUNCATION_VOXELS,
     DepthFrame,
-    Float32,
     Fusion,
     Grid,
     Surface,

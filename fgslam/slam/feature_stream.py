@@ -13,9 +13,8 @@ from itertools import islice, zip_longest
 from typing import Protocol, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, Image
+from fgslam.core.arrays import BoolArray, Float32, Image
 from fgslam.core.errors import ConfigError, FrameError, OneImageError
 from fgslam.core.log import Frame, ImageSequence, clearance
 from fgslam.core.sensors import CAMERA_NAMES
@@ -200,15 +199,15 @@ class FeatureStream:
 _Timed: TypeAlias = Future[tuple[Features, float]]
 """An image's features, and how long it took to find them."""
 
-_Margin: TypeAlias = npt.NDArray[np.float32] | None
 
-
-def _views(frame: Frame) -> Iterable[tuple[Image, _Margin]]:
+def _views(frame: Frame) -> Iterable[tuple[Image, Float32 | None]]:
     """Each image with its margins; None where it is full."""
     return zip_longest(frame.images, frame.margins)
 
 
-def _timed(extract: FeatureExtractor, image: Image, margin: _Margin) -> tuple[Features, float]:
+def _timed(
+    extract: FeatureExtractor, image: Image, margin: Float32 | None
+) -> tuple[Features, float]:
     start = time.perf_counter()
     found = _checked(extract(image))
     if margin is not None:
@@ -216,7 +215,7 @@ def _timed(extract: FeatureExtractor, image: Image, margin: _Margin) -> tuple[Fe
     return found, 1e3 * (time.perf_counter() - start)
 
 
-def _clear(found: Features, margin: npt.NDArray[np.float32]) -> BoolArray:
+def _clear(found: Features, margin: Float32) -> BoolArray:
     """Which features (n,) are clear of what shows nothing: that would be seen in every image."""
     return np.asarray(clearance(margin, found.xy) > _SUPPORT * found.scale)
 

@@ -11,10 +11,9 @@ from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.cameras.omni import Equirectangular, HyperbolicMirror, OmniCamera
-from fgslam.core.arrays import BoolArray, FloatArray, Image
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 from fgslam.worlds.driving import RADIUS_M, RangeSensor, Wheelchair
 from fgslam.worlds.floor import FloorSpace, PathPlanner
@@ -28,8 +27,6 @@ from fgslam.worlds.settings import (
     OmniHouseSettings,
 )
 from fgslam.worlds.textures import ColourBank, build_colour_library
-
-Float32 = npt.NDArray[np.float32]
 
 # Smoothing a border costs four rays a pixel: weaker contrast, summed over the three channels, is
 # not worth it.

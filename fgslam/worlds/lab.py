@@ -11,10 +11,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.core import geometry
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import Float32, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds import driving
@@ -211,9 +210,6 @@ def identity_values(settings: LabSettings) -> dict[str, Any]:
 
 # --------------------------------------------------------------------------------------------
 # Rendering
-
-
-Float32 = npt.NDArray[np.float32]
 
 
 def make_rig(settings: LabRigSettings) -> CameraRig:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, IntArray
 from fgslam.core.open3d_library import load_open3d
 
 
@@ -166,8 +166,6 @@ def placed(patches: Iterable[Patch], x: float, y: float, z: float, yaw_deg: floa
 # --------------------------------------------------------------------------------------------
 # Casting rays
 
-
-Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
 
 

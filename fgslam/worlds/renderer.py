@@ -27,14 +27,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.omni import OmniCamera
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import cache_root, replacing
 from fgslam.worlds.patches import PatchArrays, RayCaster
 from fgslam.worlds.settings import LabEffectsSettings
 from fgslam.worlds.textures import TextureBank
-
-Float32 = npt.NDArray[np.float32]
 
 LIGHT_SPACING_M = 0.09
 _MAX_CELLS = 120

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from fgslam.core.arrays import IntArray
+from fgslam.core.arrays import Float32, IntArray
 
 Grey = npt.NDArray[np.float32]
 
@@ -630,7 +630,6 @@ def _colour_materials(rng: np.random.Generator) -> dict[str, Colour]:
     }
 
 
-Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
 Packed = npt.NDArray[np.int64]
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import Float32, FloatArray
 from fgslam.core.kernels import Kernel
 from fgslam.frontend.features.anchoring import (
     FLAT,
@@ -30,7 +30,6 @@ from fgslam.frontend.features.anchoring import (
     sample,
     weighted_terms,
 )
-from fgslam.frontend.features.sift import Float32
 
 _GAIN = (0.2, 5.0)  # of light against the first patch; beyond, it is another thing
 _FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or elsewhere

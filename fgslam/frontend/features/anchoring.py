@@ -14,9 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import Float32, FloatArray
 from fgslam.core.kernels import Kernel, invert
-from fgslam.frontend.features.sift import Float32
 
 TERMS = 8
 FLAT = 1e-3  # keeps patches without any contrast solvable

@@ -7,9 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, IntArray
 from fgslam.core.geometry import wrap
 from fgslam.core.types import Words
 from fgslam.frontend.settings import AppearanceSettings
@@ -153,7 +152,7 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     return i[mutual], j[mutual]
 
 
-def squared_distances(a: ByteArray, b: ByteArray) -> npt.NDArray[np.float32]:
+def squared_distances(a: ByteArray, b: ByteArray) -> Float32:
     """Squared distances (n, m) of descriptors (n, 128) and (m, 128)."""
     # Exact in float32: every sum of 128 products of bytes is below 2^24.
     x, y = a.astype(np.float32), b.astype(np.float32)
@@ -192,7 +191,7 @@ def nearest_words(descriptors: ByteArray, count: int) -> IntArray:
     return np.asarray(order[:, :count])
 
 
-def _to_centres(descriptors: ByteArray) -> npt.NDArray[np.float32]:
+def _to_centres(descriptors: ByteArray) -> Float32:
     """Squared distances (m, w) to the centres, each row less the descriptor's own square.
 
     Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
@@ -203,7 +202,7 @@ def _to_centres(descriptors: ByteArray) -> npt.NDArray[np.float32]:
 
 
 @lru_cache(maxsize=1)
-def _centres() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def _centres() -> tuple[Float32, Float32]:
     """Twice the centres (128, w), and their squares (w,)."""
     values = vocabulary().astype(np.float32)
     return np.ascontiguousarray(2.0 * values.T), np.einsum("ij,ij->i", values, values)
@@ -213,10 +212,9 @@ EXACT = 6000  # contents up to here are compared in full, which costs no more
 PROBES = 12  # cells searched for each query, of 256
 AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens of megabytes
 LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
-_Floats = npt.NDArray[np.float32]
-Cell = tuple[ByteArray, _Floats]
+Cell = tuple[ByteArray, Float32]
 """Descriptors (m, 128) of one cell, and their squares (m,)."""
-Candidates = tuple[IntArray, IntArray, _Floats]
+Candidates = tuple[IntArray, IntArray, Float32]
 """Queries (c,), rows (c,) that may be among their nearest, squared distances less the query's own
 square (c,)."""
 
@@ -291,7 +289,7 @@ class AppearanceIndex:
         distances[query, rank] = np.sqrt((squared[first] + own[query]).astype(np.float64))
         return Neighbours(rows, distances)
 
-    def _in_full(self, asked: _Floats, neighbours: int) -> Candidates:
+    def _in_full(self, asked: Float32, neighbours: int) -> Candidates:
         found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))]
         for start in range(0, len(self), CHUNK):
             squared = _squared(asked, self._descriptors[start : start + CHUNK])
@@ -301,7 +299,7 @@ class AppearanceIndex:
         query, row, near = (np.concatenate(part) for part in zip(*found, strict=True))
         return query, row, near
 
-    def _probed(self, asked: _Floats, cells: IntArray, neighbours: int) -> Candidates:
+    def _probed(self, asked: Float32, cells: IntArray, neighbours: int) -> Candidates:
         """Searches ``cells`` (q, p): cell by cell, for all queries that want it.
 
         The distances lie behind each other as they are found: of each cell, of each query that
@@ -337,7 +335,7 @@ class AppearanceIndex:
             self._held[k] = values, np.vecdot(wide, wide)
         return self._held[k]
 
-    def _leading(self, squared: _Floats, place: IntArray, cells: IntArray) -> _Floats:
+    def _leading(self, squared: Float32, place: IntArray, cells: IntArray) -> Float32:
         """Distances (q, m) of each query to what its nearest cells hold, padded with infinity."""
         sizes = self._starts[cells + 1] - self._starts[cells]
         ends = np.minimum(np.cumsum(sizes, axis=1), LEADING)
@@ -349,7 +347,7 @@ class AppearanceIndex:
         return out
 
 
-def _squared(asked: _Floats, held: ByteArray, out: _Floats | None = None) -> _Floats:
+def _squared(asked: Float32, held: ByteArray, out: Float32 | None = None) -> Float32:
     """Squared distances (q, m) less the queries' own squares.
 
     Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
@@ -358,13 +356,13 @@ def _squared(asked: _Floats, held: ByteArray, out: _Floats | None = None) -> _Fl
     return _less_own(asked, values, np.vecdot(values, values), out)
 
 
-def _less_own(asked: _Floats, values: _Floats, squares: _Floats, out: _Floats | None) -> _Floats:
+def _less_own(asked: Float32, values: Float32, squares: Float32, out: Float32 | None) -> Float32:
     """The same of values (m, 128) whose squares (m,) are known."""
     products = (values @ (-2.0 * asked).T).T  # this way round in half the time
     return np.add(products, squares, out=out)
 
 
-def _bound(values: _Floats, count: int) -> _Floats:
+def _bound(values: Float32, count: int) -> Float32:
     """A finite bound (q,) of each row's smallest ``count`` of (q, m); ties are never cut.
 
     No larger than that many of the leading ones, where there are so many.

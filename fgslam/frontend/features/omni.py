@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -22,7 +20,7 @@ from fgslam.cameras.omni import (
     unit_rays,
     unwrap_maps,
 )
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
+from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, Image, IntArray, Rows
 from fgslam.core.bearings import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.errors import FrameError
 from fgslam.core.geometry import wrap
@@ -36,18 +34,16 @@ _MEAN_FLOOR = 8.0
 
 PATCH_SIGMAS = 6.0  # half side of the square of a feature, in SIFT scales: as its descriptor's
 
-Float32Image: TypeAlias = npt.NDArray[np.float32]
-
 PAIRS = ((0, 2), (0, 1), (1, 2))
 """R and B, R and G, G and B: the order of the paper and of all colour descriptors here."""
 
 
-def moment_images(image: Image) -> list[Float32Image]:
+def moment_images(image: Image) -> list[Float32]:
     """Bands of an image (h, w, 3) and products of their :data:`PAIRS`: 6 float32 images (h, w).
 
     Products of two bytes are exact.
     """
-    bands: list[Float32Image] = [band.astype(np.float32) for band in cv2.split(image)]
+    bands: list[Float32] = [band.astype(np.float32) for band in cv2.split(image)]
     return [*bands, *(bands[p] * bands[q] for p, q in PAIRS)]
 
 
@@ -336,8 +332,6 @@ _MIN_GRADIENT = 4.0  # of the three bands together, grey values a pixel, at a se
 _RIM_SIGMAS = 3.0
 """Of the smoothing: so far the end of the picture reaches into it."""
 
-Float32Array = npt.NDArray[np.float32]
-
 
 def dct_rows(samples: int = PROFILE_SAMPLES, count: int = COEFFICIENTS) -> FloatArray:
     """(count, samples) rows 1 to ``count`` of the orthonormal DCT-II."""
@@ -403,7 +397,7 @@ class ColumnSegmentFinder:
         pair = (np.diff(column) == 0) & (length >= shortest)
         return _Raw(column[:-1][pair], at[:-1][pair], at[1:][pair])
 
-    def _gradient(self, image: Image) -> Float32Array:
+    def _gradient(self, image: Image) -> Float32:
         """(h, w) squared colour gradient along the columns, grey values a pixel."""
         smooth = cv2.GaussianBlur(
             image.astype(np.float32),
@@ -494,7 +488,7 @@ class _ColumnSums:
     def __init__(self, image: Image) -> None:
         parts = moment_images(image)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        luminance: Float32Array = grey.astype(np.float32)
+        luminance: Float32 = grey.astype(np.float32)
         self._colours = len(parts)
         self._sums = _summed_down([*parts, luminance, luminance * luminance])
 
@@ -522,7 +516,7 @@ class _ColumnSums:
         return np.asarray(np.diff(total, axis=1) / np.diff(rows, axis=1))
 
 
-def _summed_down(parts: list[Float32Array]) -> FloatArray:
+def _summed_down(parts: list[Float32]) -> FloatArray:
     """(h + 1, k, w) sums of the rows above each row, of k images (h, w)."""
     rows = np.stack(parts, axis=1)
     out = np.zeros((len(rows) + 1, *rows.shape[1:]))
@@ -532,7 +526,7 @@ def _summed_down(parts: list[Float32Array]) -> FloatArray:
     return out
 
 
-def _summit(before: Float32Array, middle: Float32Array, after: Float32Array) -> FloatArray:
+def _summit(before: Float32, middle: Float32, after: Float32) -> FloatArray:
     """Offset in (-0.5, 0.5] of the top of the parabola through three values around a maximum."""
     curvature = before + after - 2.0 * middle
     return np.asarray(0.5 * (before - after) / np.minimum(curvature, -1e-9), np.float64)

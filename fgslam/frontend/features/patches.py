@@ -16,11 +16,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, Image, Rows
+from fgslam.core.arrays import Float32, FloatArray, Image, Rows
 from fgslam.frontend.features.alignment import align_patches
 from fgslam.frontend.features.anchoring import FLAT, TERMS, add_up, cut_patches, offsets
 from fgslam.frontend.features.matching import pairs_within
-from fgslam.frontend.features.sift import PER_PIXEL, FineImage, Float32
+from fgslam.frontend.features.sift import PER_PIXEL, FineImage
 
 View: TypeAlias = Image | FineImage
 """What patches are sampled in: grey values (h, w), between them on straight lines; or finely."""

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import hadamard
 
-from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import ByteArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.types import Features
 from fgslam.frontend.settings import Appearance, SiftSettings
@@ -213,7 +213,6 @@ def _transform(width: int) -> FloatArray:
 # ------------------------------------------------------------------------------------------
 # An image with the values halfway between its pixels, to be sampled at fractions of them
 
-Float32 = npt.NDArray[np.float32]
 PER_PIXEL = 2
 """Values of a fine image along a pixel of its image."""
 _HALFWAY = np.array([3.0, -25.0, 150.0, 150.0, -25.0, 3.0]) / 256.0

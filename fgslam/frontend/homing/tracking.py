@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
-from fgslam.cameras.omni import Equirectangular, Float32, OmniCamera, require_own_image, unwrap_maps
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.cameras.omni import Equirectangular, OmniCamera, require_own_image, unwrap_maps
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.bearings import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError, FrameError

@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.omni import OmniCamera, measure, unit_rays
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
@@ -369,8 +369,6 @@ _COLUMN_RATIO = 0.7  # column segments: nearest over second nearest distance bel
 _MAX_SCALE_RATIO = 2.0  # factor between the ratio of scales and that of the sines of the elevations
 _HORIZON_MARGIN_DEG = 3.0  # elevations nearer to the horizon may have either sign
 
-Float32Array = npt.NDArray[np.float32]
-
 
 _ROUNDING = 1e-5
 """Of squared distances of unit vectors, sums of 128 products in float32: ten times what is seen."""
@@ -380,7 +378,7 @@ def match_features(
     a: OmniFeatures,
     b: OmniFeatures,
     settings: OmniMatchingSettings,
-    squared: Float32Array | None = None,
+    squared: Float32 | None = None,
 ) -> BearingMatches:
     """Matches of both kinds: SIFT first, then column segments; each ascending in ``index_a``.
 
@@ -403,7 +401,7 @@ def match_sift(
     a: UprightFeatures,
     b: UprightFeatures,
     settings: OmniMatchingSettings,
-    squared: Float32Array | None = None,
+    squared: Float32 | None = None,
 ) -> BearingMatches:
     """Mutual nearest descriptors that are distinct, planar and of one colour."""
     if not len(a) or not len(b):
@@ -416,7 +414,7 @@ def match_sift(
 
 def planar_distances(
     a: UprightFeatures, b: UprightFeatures, settings: OmniMatchingSettings
-) -> Float32Array:
+) -> Float32:
     """(n, m) squared distances of descriptors, infinite where no motion on the plane explains."""
     squared = _squared_distances(a.descriptors, b.descriptors, settings.root)
     if settings.planar_gates:
@@ -424,7 +422,7 @@ def planar_distances(
     return squared
 
 
-def _squared_distances(a: ByteArray, b: ByteArray, root: bool) -> Float32Array:
+def _squared_distances(a: ByteArray, b: ByteArray, root: bool) -> Float32:
     x, y = _comparable(a, root), _comparable(b, root)
     norms = np.einsum("ij,ij->i", y, y)
     squared = x @ y.T
@@ -434,7 +432,7 @@ def _squared_distances(a: ByteArray, b: ByteArray, root: bool) -> Float32Array:
     return np.asarray(squared, np.float32)
 
 
-def _comparable(descriptors: ByteArray, root: bool) -> Float32Array:
+def _comparable(descriptors: ByteArray, root: bool) -> Float32:
     values = descriptors.astype(np.float32)
     if not root:
         return values
@@ -442,7 +440,7 @@ def _comparable(descriptors: ByteArray, root: bool) -> Float32Array:
     return np.asarray(np.sqrt(values / total), np.float32)
 
 
-def _forbid_impossible(squared: Float32Array, a: UprightFeatures, b: UprightFeatures) -> None:
+def _forbid_impossible(squared: Float32, a: UprightFeatures, b: UprightFeatures) -> None:
     """Sets distances of candidates to infinity that no planar motion explains."""
     margin = np.deg2rad(_HORIZON_MARGIN_DEG)
     side_a, side_b = _side(a.elevation, margin), _side(b.elevation, margin)
@@ -458,13 +456,13 @@ def _side(elevation: FloatArray, margin: float) -> npt.NDArray[np.int8]:
     return np.where(np.abs(elevation) > margin, np.sign(elevation), 0.0).astype(np.int8)
 
 
-def _height_in_sizes(features: UprightFeatures, margin: float) -> Float32Array:
+def _height_in_sizes(features: UprightFeatures, margin: float) -> Float32:
     """(n,) log of |sin(elevation)| over the apparent size, the same from everywhere."""
     height = np.maximum(np.abs(np.sin(features.elevation)), np.sin(max(margin, 1e-3)))
     return np.log(height / features.scale).astype(np.float32)
 
 
-def _mutual_nearest(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArray]:
+def _mutual_nearest(squared: Float32) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows, columns, and nearest over second nearest distance of mutual nearest pairs.
 
     A candidate without any competing candidate has ratio 0.

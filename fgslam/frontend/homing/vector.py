@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
+from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, IntArray, Rows
 from fgslam.core.bearings import (
     BearingMatches,
     OmniFeatures,
@@ -27,7 +27,6 @@ from fgslam.core.geometry import circular_median, unit, wrap
 from fgslam.frontend.homing.two_view import (
     COMMON_CHANCE,
     EpipolarTest,
-    Float32Array,
     HomingRefinement,
     Refined,
     TwoPointSamples,
@@ -528,7 +527,7 @@ class Candidates(Rows):
     log_size: FloatArray
 
 
-def candidate_matches(a: UprightFeatures, b: UprightFeatures, squared: Float32Array) -> Candidates:
+def candidate_matches(a: UprightFeatures, b: UprightFeatures, squared: Float32) -> Candidates:
     """The nearest few in the other view of each feature that is fit as evidence.
 
     Args:
@@ -567,7 +566,7 @@ def _fit(features: UprightFeatures) -> BoolArray:
     return np.asarray(corner & (features.elevation > _LOWEST))
 
 
-def _nearest_both_ways(squared: Float32Array) -> tuple[IntArray, IntArray, FloatArray]:
+def _nearest_both_ways(squared: Float32) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows, columns and relative distance of the nearest few of each row and of each column."""
     if min(squared.shape) <= _NEAREST:
         none = np.zeros(0, np.int64)
@@ -585,7 +584,7 @@ def _nearest_both_ways(squared: Float32Array) -> tuple[IntArray, IntArray, Float
     return i, j, _relative_distances(squared[i, j], least[i], least_back[j])
 
 
-def _nearest(squared: Float32Array) -> tuple[IntArray, Float32Array]:
+def _nearest(squared: Float32) -> tuple[IntArray, Float32]:
     """(n, k) columns of the nearest of each row, and (n,) the distance of the next one.
 
     One search after the other for what is nearest still: five times as fast as a partial sort.
@@ -604,7 +603,7 @@ def _nearest(squared: Float32Array) -> tuple[IntArray, Float32Array]:
     return order, next_one
 
 
-def _relative_distances(squared: Float32Array, *next_ones: Float32Array) -> FloatArray:
+def _relative_distances(squared: Float32, *next_ones: Float32) -> FloatArray:
     """(n,) product of the distance over that of the first one not kept, in either direction."""
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = [np.sqrt(np.maximum(squared, 0.0) / other) for other in next_ones]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray, Rows
 from fgslam.core.correction import RigCorrection
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import Kept
@@ -30,7 +30,7 @@ from fgslam.core.types import (
     StereoFeatures,
 )
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor_at, crowding, cut_out
-from fgslam.frontend.features.sift import FineImage, Float32
+from fgslam.frontend.features.sift import FineImage
 from fgslam.frontend.stereo import DEFORMATION, GREY_NOISE, StereoMatcher, across
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
