@@ -289,6 +289,11 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         seed: of the first trial; default the configuration's
     """
     if any(run.suffix == ".g2o" for run in runs):
+        given = (("--set", overrides), ("--out", out), ("--overwrite", overwrite),
+                 ("--resume", resume), ("--jobs", jobs > 1), ("--trials", trials),
+                 ("--seed", seed is not None))  # fmt: skip
+        if ignored := next((option for option, value in given if value), ""):
+            raise ConfigError(f"{ignored} means nothing for graphs, .g2o; leave it out")
         _solve_graphs([str(run) for run in runs], None, estimators)
         return
     from fgslam.cli.console import show_parts
@@ -324,18 +329,17 @@ def _solve_graphs(names: Sequence[str], steps: int | None, estimators: str | Non
         run_classic,
     )
 
-    kinds = None if estimators is None else estimators.split(",")
-    if refused := sorted(set(kinds or ()) - set(GRAPH_KINDS)):
+    kinds = GRAPH_KINDS if estimators is None else estimators.split(",")
+    if refused := sorted(set(kinds) - set(GRAPH_KINDS)):
         raise ConfigError(f"{refused[0]}: {NO_GRAPH}; give --estimators {','.join(GRAPH_KINDS)}")
     require_classics(names)
     rows: list[ClassicRow] = []
     with under_way() as (progress, _):
         for k, name in enumerate(names):
             progress("solving", k, len(names))
-            rows += run_classic(name, steps)
+            rows += run_classic(name, steps, kinds)
         progress("solving", len(names), len(names))
-    shown = [one for one in rows if kinds is None or one.estimator in kinds]
-    show_parts((), [classics_table(shown)], [("note", note) for note in classics_notes(shown)])
+    show_parts((), [classics_table(rows)], [("note", note) for note in classics_notes(rows)])
 
 
 @command(app)

@@ -32,7 +32,6 @@ from fgslam.evaluation.statistics import (
     SAME_TIME_S,
     associate,
     best_aligned,
-    to_estimate_world,
     value_at,
 )
 from fgslam.evaluation.truth import sound_truth
@@ -306,9 +305,11 @@ def _joint(run: tuple[Path, str] | None, truth: Any) -> Any:
 
 
 def _numbers(estimate: Estimate, truth: Trajectory, split: bool) -> dict[str, Any]:
-    path, sound = estimate.trajectory, sound_truth(estimate.trajectory, truth).trajectory
-    rows, true = to_estimate_world(path, sound or truth) or (np.empty(0, int), np.empty((0, 4, 4)))
+    path = estimate.trajectory
+    sound = sound_truth(path, truth).trajectory or truth
+    rows, of = associate(path.timestamps, sound.timestamps)
     poses, covariances = path.poses[rows], estimate.covariances[rows]
+    true = poses[0] @ inverse(sound.poses[of[0]]) @ sound.poses[of]
     sizes = np.trace(covariances, axis1=1, axis2=2)
     exact = int(not sizes[0] > _EXACT * np.nanmedian(sizes))  # then it is the gauge, and no error
     if not exact:
@@ -344,7 +345,10 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
 
 
 def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
-    """The log with every second landmark alone; those that a loop merges stay together."""
+    """The log with every second landmark alone; those that a loop merges stay together.
+
+    What is measured of poses alone stays in both, as odometry does.
+    """
     stays: dict[int, int] = {}
 
     def root(identity: int) -> int:
@@ -381,6 +385,7 @@ def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
             missed_ids=one.missed_ids[missed],
             pruned_ids=one.pruned_ids[pruned],
             loops=loops,
+            measured=tuple(m if m.of_pose else m.select(kept(m.ids)) for m in one.measured),
         )
         out.append(half_of_one)
     return out

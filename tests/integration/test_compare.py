@@ -288,6 +288,19 @@ def test_what_is_no_run_is_reported(
     assert "give it to fgslam run first, or add --trials" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "option",
+    ["--set x.y=1", "--out o", "--overwrite", "--resume", "--jobs 2", "--trials 3", "--seed 0"],
+)
+def test_what_a_graph_cannot_use_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, option: str
+) -> None:
+    graph = tmp_path / "a.g2o"
+    graph.touch()
+    assert main(monkeypatch, "compare", graph, *option.split()) == 2
+    assert f"{option.split()[0]} means nothing for graphs" in capsys.readouterr().err
+
+
 def test_a_damaged_truth_is_reported_before_anything_is_written(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

@@ -32,6 +32,11 @@ def test_graphs_with_truth_are_judged(name: str, steps: int) -> None:
     assert online.chi_square == pytest.approx(batch.chi_square, rel=0.1)
 
 
+def test_a_solver_that_is_not_asked_for_does_not_solve() -> None:
+    for kind in ("isam2", "batch"):
+        assert [one.estimator for one in run_classic("w10000", 40, [kind])] == [kind]
+
+
 @pytest.mark.slow
 def test_victoria_park_is_solved_to_the_known_optimum() -> None:
     """GTSAM's own example has an error of 2339.22, half the chi-square."""
