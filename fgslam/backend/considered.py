@@ -44,7 +44,6 @@ from fgslam.core.correction import (
 )
 from fgslam.core.geometry import (
     adjoint,
-    block_diagonal,
     congruence,
     in_front,
     inverse,
@@ -320,16 +319,6 @@ class ConsiderCovariance(ErrorColumns):
         columns = self.kept("columns", known.ids)
         more = columns @ covariance @ np.swapaxes(columns, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
-
-    def joint(self, ids: IntArray, covariance: FloatArray) -> FloatArray:
-        """A joint covariance (6 + 3k, 6 + 3k) of newest pose and landmarks with what it adds."""
-        terms = self._terms.covariance
-        if terms is None:
-            return covariance
-        columns = np.concatenate(
-            [self._pose_columns, self._of_map(ids).reshape(-1, self._terms.count)]
-        )
-        return np.asarray(covariance + columns @ terms @ columns.T)
 
     # ----------------------------------------------------------------------------------------
 
@@ -698,22 +687,6 @@ class SampledErrors(ErrorColumns):
         covariances = known.covariances.copy()
         covariances[have] = self._covariances(columns[have], 3)
         return dataclasses.replace(known, covariances=covariances)
-
-    def joint(self, pose: FloatArray, known: LandmarkMap) -> FloatArray:
-        """(6 + 3k, 6 + 3k) covariance of newest pose (6, 6) and landmarks, both as reported.
-
-        Fewer samples than dimensions make it singular: it is shrunk towards independence.
-        """
-        blocks = block_diagonal(pose, known.covariances)
-        if self._off:
-            return blocks
-        own = block_diagonal(np.ones((6, 6)), np.ones((len(known), 3, 3)))
-        landmarks = self._weighed(self._of_map(known.ids), 3)
-        columns = np.concatenate(
-            [self._weighed(self._pose_columns, self._solver.floor.rigid_dof), *landmarks]
-        )
-        kept = SAMPLES / (SAMPLES + len(blocks))
-        return np.where(own > 0.0, blocks, kept * (columns @ columns.T))
 
     # ----------------------------------------------------------------------------------------
 

@@ -11,11 +11,11 @@ To add an estimator:
    covariances in the pose's tangent space, rotation first. ``examples/`` shows a small one; an
    object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
 2. Where it can do more, add the members of :class:`~fgslam.core.store.Resumable` (interrupted runs;
-   or mark what it keeps as :class:`~fgslam.core.store.Kept`), :class:`FullEstimator` or
-   :class:`MapUser` (beginning in a saved map). What asks for them refuses an estimator without, in
-   one line. A ``recalibrate(correction, since)`` follows a rig that calibrates itself
-   (:func:`recalibrated`); ``noise_factors``, on the stated deviations of a single measurement and
-   as it is weighed, is only shown.
+   or mark what it keeps as :class:`~fgslam.core.store.Kept`) or :class:`MapUser` (beginning in a
+   saved map). What asks for them refuses an estimator without, in one line. A
+   ``recalibrate(correction, since)`` follows a rig that calibrates itself (:func:`recalibrated`);
+   ``noise_factors``, on the stated deviations of a single measurement and as it is weighed, is
+   only shown.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
    its ``family``; add it to the union there, and one row to the table of makers in
@@ -96,21 +96,6 @@ class Estimator(Protocol):
 
         A frame for each update; ``remarks`` say in words what a reader of the result must know.
         """
-        ...
-
-
-class FullEstimator(Estimator, Protocol):
-    """What the estimators of this package offer: also how their landmarks' errors are correlated.
-
-    Both raise KeyError for a landmark that the estimator does not hold.
-    """
-
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks, world axes, metres squared."""
-        ...
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of the last pose and the named landmarks, in order."""
         ...
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from fgslam.backend.protocol import Estimator, FullEstimator, MapUser
+from fgslam.backend.protocol import Estimator, MapUser
 from fgslam.backend.settings import ESTIMATORS, EstimatorSettings, FloorMode
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import term_names
@@ -139,7 +139,7 @@ def make_estimator(
     settings: EstimatorSettings,
     ego_motion: EgoMotionSettings | None = None,
     prior: Prediction | None = None,
-) -> FullEstimator:
+) -> Estimator:
     """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
 
     ``ego_motion`` are the front-end's settings: ``floor: auto`` takes their degrees of freedom
@@ -150,7 +150,7 @@ def make_estimator(
     return _MAKERS[settings.kind](rig, settings, prior, ego_motion)
 
 
-_MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], FullEstimator]] = {
+_MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], Estimator]] = {
     "odometry": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.filters.dead_reckoning"
     ).DeadReckoning(rig, prior),

@@ -508,16 +508,6 @@ class FullEkf:
             noise_factor=1.0,
         )
 
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks."""
-        held = self.landmarks()
-        return self._considered.landmarks(held.select(held.rows(ids))).covariances
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks, the rig's terms included."""
-        rows = rows_of(self._blocks(ids)).ravel()
-        return self._considered.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
-
     @property
     def keeps_maps(self) -> bool:
         """True: as in Schmidt's filter, landmarks may be uncertain and yet not be changed."""
@@ -728,11 +718,6 @@ class GrowingCovariance:
         """(k, 3, 3) the landmarks' own covariances."""
         at = rows_of(blocks)
         return _mirrored(self._buffer[at[:, :, None], at[:, None, :]])
-
-    def square(self, index: IntArray) -> FloatArray:
-        """(k, k) the rows and columns of these indices, in their order."""
-        low, high = np.minimum(index, index[:, None]), np.maximum(index, index[:, None])
-        return np.asarray(self._buffer[high, low])
 
     def set_front(self, front: FloatArray) -> None:
         """Replaces the pose's columns (n, 6), and so its rows."""

@@ -283,15 +283,6 @@ class LandmarkKalman:
             online_relative=relative,
         )
 
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Covariances (k, 3, 3) of the named landmarks."""
-        return self._errors.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Pose and landmarks, as reported; those that stay as they are are independent."""
-        known = self._errors.landmarks(self._rows.map().select(self._rows.rows(ids)))
-        return self._errors.joint(self._errors.pose(self._current).covariance, known)
-
     # -- for loops, saved maps and smoothers ---------------------------------------------------
 
     @property

@@ -327,13 +327,6 @@ class Bordered:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         return self.held.landmarks() + self._of(self.gain[: self.held.system.columns], 3)
 
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
-        at = self.held.system.columns + 6 * pose + np.arange(6)
-        rows = np.concatenate([at, (3 * landmarks[:, None] + np.arange(3)).ravel()])
-        gain = self.gain[rows]
-        return np.asarray(self.held.joint(pose, landmarks) + gain @ self.covariance @ gain.T)
-
     @property
     def estimated(self) -> FloatArray:
         """(b, b) covariance of the border that the system itself has."""
@@ -510,29 +503,17 @@ class Eliminated:
 
     def pose(self, row: int) -> FloatArray:
         """(6, 6) marginal of the window's pose in a row."""
-        return self.joint(row, np.empty(0, np.int64))
+        at = self._r + 6 * row + np.arange(6)
+        unit = np.zeros((len(self._size), 6))
+        unit[at, np.arange(6)] = 1.0 / self._size[at]
+        half = solve_triangular(self._factor, unit, lower=True, check_finite=False)
+        out = half.T @ half
+        return np.asarray(0.5 * (out + out.T))
 
     def poses(self, rows: list[int]) -> FloatArray:
         """(6k, 6k) joint covariance of the window's poses in some rows."""
         at = (self._r + 6 * np.array(rows)[:, None] + np.arange(6)).ravel()
         return self._covariance[np.ix_(at, at)]
-
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by rows."""
-        k, at = len(landmarks), self._r + 6 * pose + np.arange(6)
-        gain = np.zeros((len(self._size), 6 + 3 * k))
-        gain[at, np.arange(6)] = 1.0
-        for column, row in enumerate(landmarks.tolist()):
-            gain[:, 6 + 3 * column : 9 + 3 * column] = -self._follows(row).T
-        half = solve_triangular(
-            self._factor, gain / self._size[:, None], lower=True, check_finite=False
-        )
-        out = half.T @ half
-        own = self._own(landmarks)
-        for column in range(k):
-            rows = slice(6 + 3 * column, 9 + 3 * column)
-            out[rows, rows] += own[column]
-        return np.asarray(0.5 * (out + out.T))
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals of all landmarks."""
@@ -557,16 +538,6 @@ class Eliminated:
         eye = np.broadcast_to(np.eye(3), (len(landmarks), 3, 3))
         inverse = _forward(self._root[:, landmarks], eye)
         return np.asarray(np.swapaxes(inverse, 1, 2) @ inverse)
-
-    def _follows(self, row: int) -> FloatArray:
-        """(3, c) how a landmark's mean follows the corner, negated."""
-        at = np.array([row])
-        whole = np.zeros((1, 3, len(self._size)))
-        whole[0, :, self._r :] = self._by_pose[row]
-        tied = np.flatnonzero(self._tied == row)
-        if len(tied):
-            whole[0, :, : self._r] = self._by_hidden[tied[0]]
-        return np.asarray(_backward(self._root[:, at], whole)[0])
 
     def _along(self, corner: FloatArray) -> FloatArray:
         """(m, 3, 1) how the landmarks' halves follow a step of the corner (c, 1)."""
@@ -852,20 +823,6 @@ class GraphMarginals:
             half += summed(point[one], np.swapaxes(gain[one], 1, 2) @ covariance @ gain[other], m)
         return np.asarray(self.inverse + half + np.swapaxes(half, 1, 2))
 
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
-        k, s = len(landmarks), self.system
-        gain = np.zeros((6 * len(s.pose_keys), 6 + 3 * k))
-        gain[6 * pose + np.arange(6), np.arange(6)] = 1.0
-        columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
-        seen = s.coupling.tocsc()[:, columns].toarray().reshape(len(gain), k, 3)
-        inverse = self.inverse[landmarks]
-        gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(len(gain), 3 * k)
-        out = gain.T @ self.factor.solve(gain)
-        at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
-        out[at[:, :, None], at[:, None, :]] += inverse
-        return np.asarray(0.5 * (out + out.T))
-
 
 def _own_inverses(system: LinearSystem) -> FloatArray:
     """(m, 3, 3) of each landmark's own block."""
@@ -1000,25 +957,6 @@ class ChainMarginals:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         columns = self.system.columns
         return _diagonal(self.border.inverse[:columns, :columns], 3)
-
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
-        columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
-        on, gain, alone = self._hangs(pose)
-        covariance = self.border.inverse
-        cross = -(gain @ covariance[np.ix_(on, columns)])
-        own = alone + gain @ covariance[np.ix_(on, on)] @ gain.T
-        return np.block([[own, cross], [cross.T, covariance[np.ix_(columns, columns)]]])
-
-    def _hangs(self, pose: int) -> tuple[IntArray, FloatArray, FloatArray]:
-        """What of the kept a pose depends on, how (6, c), and its covariance if that is held."""
-        for segment in self.segments:
-            at = np.flatnonzero(segment.rows == 6 * pose)
-            if len(at):
-                first = int(at[0])
-                return segment.columns, segment.gain[first : first + 6], segment.own()[first // 6]
-        first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
-        return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
 
 
 def _entries_of(rows: IntArray) -> IntArray:

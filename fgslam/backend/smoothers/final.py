@@ -30,7 +30,6 @@ from fgslam.backend.smoothers.graph import (
     GraphBuilder,
     Smoothed,
     Solution,
-    allowed_joint,
     allowed_parts,
     first_guess,
     found_again,
@@ -367,21 +366,6 @@ class WholeGraphSolver:
     def solution(self) -> Solution:
         """All poses and landmarks at the minimum over all that was measured, with marginals."""
         return solution(self.refined(), self.builder.frames, self._floor)
-
-    @one_blas_thread()
-    def joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the graph's last pose and landmark variables.
-
-        Raises:
-            EstimatorError: a landmark was left out of the last solution.
-        """
-        refined = self.refined()
-        lost = set(variables) - set(refined.variables)
-        if lost:
-            raise EstimatorError(f"{self.builder.describe(min(lost))} was left out of the graph")
-        rows = np.searchsorted(refined.variables, variables).astype(np.int64)
-        joint = refined.marginals.joint(len(refined.state.poses) - 1, rows)
-        return allowed_joint(self._floor, refined.state.poses[-1], joint)
 
     def refined(self) -> Refined:
         """The graph's last solution."""

@@ -656,16 +656,6 @@ def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> F
     return np.array([floor.allowed_part(pose, covariance) for pose, covariance in pairs])
 
 
-def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArray:
-    """Joint covariance of a pose ``wTc`` and others without what a hard floor excludes of it."""
-    if floor.rigid_dof == 6:
-        return joint
-    basis = floor.basis(wTc)
-    project = np.eye(len(joint))
-    project[:6, :6] = basis @ basis.T
-    return congruence(project, joint)
-
-
 def suspect(error: Exception) -> int | None:
     """Key of the variable near which GTSAM reports an indeterminate system, if it does."""
     words = str(error).split("variable", 1)
@@ -744,10 +734,6 @@ class GraphSolver(Protocol):
 
     def solution(self) -> Solution:
         """All poses and landmarks of the graph, with marginal covariances; changes nothing."""
-        ...
-
-    def joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of the graph's last pose and landmark variables."""
         ...
 
 

@@ -27,7 +27,6 @@ from fgslam.backend.smoothers.graph import (
     Smoothed,
     Solution,
     TrackedFrame,
-    allowed_joint,
     allowed_parts,
     closed_chain,
     drift_undone,
@@ -165,12 +164,6 @@ class FixedLagSolver:
             dict(zip(inside, places, strict=True)),
             dict(zip(inside, found, strict=True)),
         )
-
-    def joint(self, variables: list[int]) -> FloatArray:
-        """Joint covariance of the last pose and landmark variables of the window."""
-        solved = self._at_last()
-        joint = solved.eliminated.joint(len(solved.frames) - 1, solved.rows(variables))
-        return allowed_joint(self._floor, self.poses[-1], joint)
 
     # ----------------------------------------------------------------------------------------
 

@@ -340,40 +340,6 @@ class Smoother:
                 )
         return self._answer
 
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks."""
-        self.tracker.landmarks().rows(ids)
-        found = self.estimate().landmarks
-        return found.covariances[found.rows(ids)]
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks."""
-        self.tracker.landmarks().rows(ids)
-        tracks = [self.builder.admission.tracks.get(i) for i in ids.tolist()]
-        variables = [-1 if track is None else track.variable for track in tracks]
-        outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
-        if outside:
-            raise EstimatorError(
-                f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
-                "its marginal instead"
-            )
-        joint = self._at_last_frame(self.solver.joint(variables))
-        if self._considered.present and not self._solved().considers_rig:
-            joint = self._considered.joint(ids, joint)
-        return joint
-
-    def _at_last_frame(self, joint: FloatArray) -> FloatArray:
-        """A joint covariance with the graph's last pose, carried on to the last frame's."""
-        entered, last = self.builder.frames[-1], len(self.inputs) - 1
-        if entered == last:
-            return joint
-        answer = self._solved()
-        carry = np.eye(len(joint))
-        carry[:6, :6] = adjoint(inverse(answer.poses[last]) @ answer.poses[entered])
-        joint = congruence(carry, joint)
-        joint[:6, :6] = answer.pose_covariances[last]
-        return joint
-
     def recalibrate(self, correction: FloatArray, since: int = 0) -> None:
         """Where the tracker's map moves, corrects all that was measured since then again."""
         change = self.tracker.recalibrate(correction, since)

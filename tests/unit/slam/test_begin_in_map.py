@@ -227,7 +227,7 @@ def test_independent_landmarks_in_the_joint_covariance(rng: np.random.Generator)
     covariance = GrowingCovariance(np.diag(np.arange(1.0, 7.0)))
     covariance.append(np.ones((FRONT, 3)), np.eye(3))
     covariance.append_independent(blocks)
-    whole = covariance.square(np.arange(FRONT + 18))
+    whole = covariance.columns(np.arange(FRONT + 18))
     np.testing.assert_array_equal(covariance.diagonal_blocks(np.arange(1, 6)), blocks)
     for k in range(1, 6):
         rows = rows_of(np.array([k]))[0]

@@ -8,6 +8,7 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from simulated import RIG, Drive, Simulation, assert_same_bits, simulate, tracked_at
 
 from fgslam.backend.filters.ekf import (
@@ -145,12 +146,14 @@ def test_filter_is_the_graph_marginalised_at_the_same_linearisation_points() -> 
         mean, covariance = linear.last(known.ids.tolist())
         found = np.concatenate([linear.step, known.positions.ravel()])
         np.testing.assert_allclose(found, mean, rtol=0, atol=1e-9)
-        joint = estimator.joint_covariance(known.ids)
-        np.testing.assert_allclose(joint, covariance, rtol=0, atol=1e-9)
-        sigma = np.sqrt(np.diagonal(joint))
-        np.testing.assert_allclose(
-            joint / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), rtol=0, atol=1e-7
+        # What they share shows in those of the frames that follow.
+        estimate = estimator.estimate()
+        blocks = block_diag(estimate.covariances[-1], *estimate.landmarks.covariances)
+        joint = np.where(
+            block_diag(np.ones((6, 6)), *len(known) * [np.ones((3, 3))]), covariance, 0
         )
+        sigma = np.sqrt(np.diagonal(covariance))
+        np.testing.assert_allclose((blocks - joint) / np.outer(sigma, sigma), 0, rtol=0, atol=1e-7)
     assert len(known) > 15
 
 
@@ -175,7 +178,7 @@ def grown(p: FloatArray) -> GrowingCovariance:
 
 
 def whole(covariance: GrowingCovariance) -> FloatArray:
-    return covariance.square(np.arange(6 + 3 * covariance.blocks))
+    return covariance.columns(np.arange(6 + 3 * covariance.blocks))
 
 
 def test_uninitialised_memory_does_not_matter(
@@ -277,13 +280,12 @@ def test_covariance_stays_positive_over_300_frames() -> None:
     estimator = make()
     for increment in drawn(turning, 2).increments:
         step(estimator, increment)
-    ids = estimator.landmarks().ids
-    joint = estimator.joint_covariance(ids)
-    np.testing.assert_array_equal(joint, joint.T)
-    sigma = np.sqrt(np.diagonal(joint))
-    correlation = joint / np.outer(sigma, sigma)
-    assert np.linalg.eigvalsh(correlation).min() > -1e-12
-    assert np.linalg.matrix_rank(joint, hermitian=True, tol=1e-16) == len(joint)
+    found = estimator.estimate()
+    for covariances in (found.covariances[1:], found.landmarks.covariances):
+        np.testing.assert_array_equal(covariances, np.swapaxes(covariances, 1, 2))
+        sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+        correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
+        assert np.linalg.eigvalsh(correlation).min() > 1e-9
 
 
 # --------------------------------------------------------------------------------------------
@@ -306,12 +308,18 @@ def test_pruning_a_landmark_leaves_the_others_unchanged() -> None:
     step(pruned, dataclasses.replace(blind, pruned_ids=gone))
     rest = np.setdiff1d(ids, gone)
     np.testing.assert_array_equal(pruned.landmarks().ids, rest)
-    np.testing.assert_array_equal(pruned.joint_covariance(rest), kept.joint_covariance(rest))
     rows = kept.landmarks().rows(rest)
     np.testing.assert_array_equal(pruned.landmarks().positions, kept.landmarks().positions[rows])
-    with pytest.raises(KeyError):
-        pruned.joint_covariance(gone)
-    assert_same_bits(pruned.landmark_covariances(rest), pruned.landmarks().covariances)
+    found, expected = (one.landmarks().covariances for one in (pruned, kept))
+    np.testing.assert_array_equal(found, expected[rows])
+    seen = simulation.increments[7].observations
+    after = dataclasses.replace(
+        simulation.increments[7],
+        observations=seen.select(np.isin(seen.ids, rest)),
+        pruned_ids=nothing,
+    )
+    covariances = [step(one, after).covariance for one in (pruned, kept)]
+    np.testing.assert_allclose(*covariances, rtol=0.0, atol=1e-15)
 
 
 def test_too_many_landmarks_are_refused_and_change_nothing() -> None:

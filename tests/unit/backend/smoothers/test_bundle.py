@@ -433,7 +433,6 @@ def test_step_and_covariances_are_those_of_the_whole_system(
     for one, rows in (
         (found.poses()[-1], last),
         (found.landmarks()[2], np.arange(6, 9)),
-        (found.joint(len(state.poses) - 1, np.array([2])), np.r_[last, 6:9]),
         (found.estimated, np.arange(len(dense) - len(border.own), len(dense))),
     ):
         scale = np.abs(covariance[np.ix_(rows, rows)]).max()

@@ -220,12 +220,6 @@ def either(graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
     return reduced(system.linear(state))
 
 
-def reference_joint(reference: Any, keys: list[int]) -> FloatArray:
-    """GTSAM's joint covariance in the order of ``keys``, block by block."""
-    found = reference.jointMarginalCovariance(keys)
-    return np.block([[found.at(a, b) for b in keys] for a in keys])
-
-
 def assert_same(found: FloatArray, expected: FloatArray) -> None:
     """Equal relative to the deviations of row and column."""
     sigma = np.sqrt(np.diagonal(expected))
@@ -266,20 +260,6 @@ def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Gener
         assert_same(covariance, reference.marginalCovariance(key))
     for key, covariance in zip(problem.landmarks, landmarks, strict=True):
         assert_same(covariance, reference.marginalCovariance(key))
-
-
-@pytest.mark.parametrize("kind", BOTH)
-@pytest.mark.parametrize("which", [[0], [1, 4, 2], [6, 0, 5, 3, 1, 2, 4], []])
-def test_joint_marginals_in_the_order_asked_for(
-    which: list[int], kind: Whole, rng: np.random.Generator
-) -> None:
-    problem = Problem(rng)
-    reference = problem.reference()
-    found = whole(kind, problem.graph, problem.values)
-    for row, key in enumerate(problem.poses):
-        keys = [key, *(problem.landmarks[n] for n in which)]
-        expected = reference_joint(reference, keys) if which else reference.marginalCovariance(key)
-        assert_same(found.joint(row, np.array(which, np.int64)), expected)
 
 
 def test_the_larger_group_is_eliminated_first(rng: np.random.Generator) -> None:
@@ -353,9 +333,6 @@ def test_poses_that_close_loops(rng: np.random.Generator, ends: list[tuple[int, 
             assert_same(found.poses()[k], reference.marginalCovariance(key))
         for n, key in enumerate(problem.landmarks):
             assert_same(found.landmarks()[n], reference.marginalCovariance(key))
-        for pose in range(len(problem.poses)):
-            keys = [problem.poses[pose], problem.landmarks[2], problem.landmarks[0]]
-            assert_same(found.joint(pose, np.array([2, 0])), reference_joint(reference, keys))
 
 
 def test_nothing_is_inverted_without_a_word_on_the_terminal(

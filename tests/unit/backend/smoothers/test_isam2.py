@@ -207,21 +207,6 @@ def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
         restore(straight, state_of(first))
 
 
-@pytest.mark.parametrize("frames", [13, 15, 16])
-def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -> None:
-    _, estimator = played(frames, Isam2Settings(keyframe_every=4, update_every=4))
-    found = estimator.estimate()
-    held = [i for i, track in estimator.builder.admission.tracks.items() if track.variable >= 0]
-    ids = np.intersect1d(held, found.landmarks.ids)[:5]
-    joint = estimator.joint_covariance(ids)
-    np.testing.assert_allclose(joint[:6, :6], found.covariances[-1], rtol=1e-9, atol=1e-18)
-    own = estimator.landmark_covariances(ids)
-    for k in range(len(ids)):
-        at = slice(6 + 3 * k, 9 + 3 * k)
-        np.testing.assert_allclose(joint[at, at], own[k], rtol=1e-6, atol=1e-12)
-    assert np.linalg.eigvalsh(joint)[0] > -1e-12
-
-
 def test_landmarks_behind_a_camera_are_put_back_before_it() -> None:
     """Where a bad step has left them nothing holds them, and the solver fails on each in turn."""
     simulation, estimator = played(13)

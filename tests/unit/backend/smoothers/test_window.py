@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from simulated import RIG, play
 from smoothing import FREE, build, drawn
 
@@ -34,10 +35,12 @@ def window() -> Window:
     return estimator.solver.window
 
 
-def joint(window: Window, variables: IntArray) -> FloatArray:
-    """Covariance of the last pose and of landmarks, linearised where the window is."""
+def covariances(window: Window, variables: IntArray) -> FloatArray:
+    """Of the last poses together, and of each landmark, linearised where the window is."""
     rows = np.searchsorted(window.landmarks.variables, variables)
-    return Eliminated(window.equations()).joint(len(window.frames) - 1, rows)
+    found = Eliminated(window.equations())
+    poses = [window.frames.index(frame) for frame in range(FIRST, FRAMES)]
+    return np.asarray(block_diag(found.poses(poses), *found.landmarks()[rows]))
 
 
 def assert_same(found: FloatArray, expected: FloatArray) -> None:
@@ -50,11 +53,11 @@ def assert_same(found: FloatArray, expected: FloatArray) -> None:
 
 def test_what_has_left_leaves_the_covariances_as_they_were(window: Window) -> None:
     inside = np.unique(window.observed.points[window.observed.poses >= FIRST])
-    expected = joint(window, inside)
+    expected = covariances(window, inside)
     window.let_go_before(FIRST)
     assert window.frames == list(range(FIRST, FRAMES))
     np.testing.assert_array_equal(window.landmarks.variables, inside)
-    assert_same(joint(window, inside), expected)
+    assert_same(covariances(window, inside), expected)
 
 
 def test_fewer_hidden_numbers_say_the_same(window: Window) -> None:
@@ -63,11 +66,11 @@ def test_fewer_hidden_numbers_say_the_same(window: Window) -> None:
     for variable in window.prior.variables[6:].tolist():
         window.take_out(variable)
     inside = window.landmarks.variables
-    expected = joint(window, inside)
+    expected = covariances(window, inside)
     assert window.prior.hidden > 3 * len(window.prior.variables)
     window.prior = window.prior.compressed()
     assert window.prior.hidden <= 3 * len(window.prior.variables)
-    assert_same(joint(window, inside), expected)
+    assert_same(covariances(window, inside), expected)
 
 
 def test_the_place_of_rest_stays(window: Window) -> None:
