@@ -139,7 +139,7 @@ class FixedLagSettings(GraphSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class Isam2Settings(GraphSettings):
-    """iSAM2 over all poses and landmarks."""
+    """iSAM2: all poses and landmarks in one graph; each frame, the part that changed is solved."""
 
     kind: Literal["isam2"] = "isam2"
     update_every: Count = Field(
@@ -166,7 +166,7 @@ class SlidingWindowSettings(GraphSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class BatchSettings(GraphSettings):
-    """Everything at once, the reference of the comparison."""
+    """Everything at once in one least-squares problem: what all others are compared with."""
 
     kind: Literal["batch"] = "batch"
     gate_px: NonNegative = Field(

@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE
+from fgslam.runs.folder import LOG_FILE, METRICS_FILE, REPORT_FILE, next_commands
 
 if TYPE_CHECKING:
     from fgslam.cli.signals import Tell
@@ -118,9 +118,8 @@ def _files(result: RunResult) -> Iterator[tuple[str, str]]:
     if (result.folder / REPORT_FILE).is_file():
         yield "report", f"{result.folder / REPORT_FILE}  (open it in a browser)"
     if result.status == "finished" and (result.folder / LOG_FILE).is_file():
-        yield "next", f"fgslam compare {result.folder} --estimators landmark_kalman,isam2,batch"
-        yield "", f"fgslam export {result.folder} --map map.ply --colour"
-        yield "", f"fgslam film {result.folder} run.mp4"
+        for k, command in enumerate(next_commands(result.folder)):
+            yield "" if k else "next", command
 
 
 def _console() -> Console:

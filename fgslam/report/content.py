@@ -103,6 +103,23 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A drive that a slider moves along, in k steps.
+
+    Attributes:
+        colours: of the m paths.
+        seconds: (k,) since the start.
+        places: (m, k, 3) to the right, ahead and up, metres; NaN where not known.
+        views: small JPEG images of the reference camera, by the step from which they are shown.
+    """
+
+    colours: tuple[str, ...]
+    seconds: FloatArray
+    places: FloatArray
+    views: Mapping[int, bytes]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Page:
     """All that one page shows.
 
@@ -115,6 +132,9 @@ class Page:
         remarks: of the estimators, in words; None where the page has no section for them.
         config_yaml: the resolved configuration, as text.
         versions: of the program and its libraries; None where one is not installed.
+        about: names of what is compared, and what each is.
+        commands: what one may type next.
+        drive: moves the figures along; None where there is no path.
     """
 
     title: str
@@ -128,6 +148,9 @@ class Page:
     remarks: tuple[str, ...] | None = None
     config_yaml: str = ""
     versions: Mapping[str, str | None] = field(default_factory=dict)
+    about: tuple[tuple[str, str], ...] = ()
+    commands: tuple[str, ...] = ()
+    drive: Drive | None = None
 
 
 # --------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from fgslam.report.content import (
     INK,
     ON_LIGHT,
     SIGMAS,
+    Drive,
     Figure,
     bulk_limits,
     exaggeration,
@@ -42,6 +43,7 @@ from fgslam.report.results import (
     EstimatorReport,
     ReportData,
     judged_report,
+    same_times,
     truth_in_their_world,
 )
 
@@ -243,7 +245,8 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     return Figure(
         "above",
         "The drive from above",
-        "Solid: the path as known at the end. Dotted: each pose as first estimated. Dashed: the "
+        "Where did it drive, and how sure is it of that? Solid: the path as known at the end. "
+        "Dotted: each pose as first estimated. Dashed: the "
         f"truth. An ellipse reaches {SIGMAS:.0f} standard deviations of the position as the "
         "estimator claims it. Dots: landmarks"
         + (", coloured by height" if alone else "")
@@ -256,6 +259,24 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
         plane(traces, (limits + more * [-1.0, 1.0]).tolist()),
         note=" ".join(filter(None, [larger, thinning])),
     )
+
+
+_STEPS = 300
+
+
+def drive_along(data: ReportData) -> Drive | None:
+    """Where each estimator's final path is, step by step; None without a path."""
+    level, first = level_axes(data.up), data.estimators[0] if data.estimators else None
+    if first is None or not len(first):
+        return None
+    rows = thinned(len(first), _STEPS)
+    places = np.full((len(data.estimators), len(rows), 3), np.nan)
+    for path, one in zip(places, data.estimators, strict=True):
+        steps, of = same_times(first.timestamps[rows], one.timestamps)
+        path[steps] = one.final_poses[of, :3, 3] @ level.T
+    views = {int(np.searchsorted(rows, row)): view for row, view in sorted(data.views.items())}
+    tints = tuple(colour(i) for i in range(len(data.estimators)))
+    return Drive(tints, first.timestamps[rows] - data.start, places, views)
 
 
 def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
@@ -301,7 +322,8 @@ def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     return Figure(
         "map",
         "The map in three dimensions",
-        "Drag to turn, pinch or scroll to come closer, drag with the right button to shift. Dots: "
+        "Do the landmarks look like the place? Drag to turn, pinch or scroll to come closer, drag "
+        "with the right button to shift. Dots: "
         "landmarks, coloured by height. Lines as above.",
         go.Figure(
             [*traces, *_paths(data, level, detail)],
@@ -452,6 +474,7 @@ _MAX_POINTS_ALONG = 800  # of each of an estimator's three curves and bands
 _MAX_POINTS_NOISE = 1_000
 _WIDELY = 8.0
 _LEAST_NEES = 1e-9
+_LEAST_MS = 0.05  # of a stage that is drawn, in the mean
 
 
 def _over_time(
@@ -485,7 +508,8 @@ def error_over_time(data: ReportData) -> Figure:
     return Figure(
         "error",
         "Position error over time",
-        "Distance of each pose from the truth, the first pose aligned. Solid: the final path. "
+        "How far off is it, and did it know? Distance of each pose from the truth, the first pose "
+        "aligned. Solid: the final path. "
         "Dotted: each pose as first estimated. Dashed: three standard deviations of the position "
         "as claimed (three times the root of the summed variances): errors should mostly stay "
         "below it.",
@@ -532,8 +556,9 @@ def error_by_axis(data: ReportData) -> Figure:
     return Figure(
         "axes",
         "Position error along the axes",
-        "Estimate minus truth of the final positions, the first pose aligned. Band: three standard "
-        "deviations as claimed, which should hold nearly all of it.",
+        "In which direction does it drift? Estimate minus truth of the final positions, the first "
+        "pose aligned. Band: three standard deviations as claimed, which should hold nearly all of "
+        "it.",
         panels(traces, {f"{name} ({unit})": {} for name in _LEVEL}),
         missing=_missing(data),
     )
@@ -566,7 +591,8 @@ def matches_over_time(estimator: EstimatorReport) -> Figure:
     return Figure(
         "matches",
         "Matches and map",
-        "Landmarks matched and used in each frame, and landmarks in the map.",
+        "Does it see enough to be sure of its pose? Landmarks matched and used in each frame, and "
+        "landmarks in the map.",
         panels(traces, dict.fromkeys(("landmarks a frame", "landmarks in the map"), _TO_ZERO)),
         note=note,
     )
@@ -596,8 +622,9 @@ def nees_over_time(data: ReportData) -> Figure:
     return Figure(
         "nees",
         "Consistency over time (NEES)",
-        "Squared error of each final pose in units of its own claimed covariance, per degree of "
-        "freedom: 1 is right on average, more is overconfident, less is conservative. Band: 95 % "
+        "Can its covariances be believed? Squared error of each final pose in units of its own "
+        "claimed covariance, per degree of freedom: 1 is right on average, more is overconfident, "
+        "less is conservative. Band: 95 % "
         f"of the values of a consistent estimator, frame by frame ({'; '.join(each) or 'not known'}"
         ").",
         drawing(traces, _SECONDS, "NEES per degree of freedom", yaxis={"type": "log"}),
@@ -613,8 +640,51 @@ def time_per_frame(data: ReportData) -> Figure:
     return Figure(
         "time",
         "Time for each frame",
-        "Wall-clock time of the estimator's own work for a frame, on the machine of the run.",
+        "Which estimator keeps up, and which grows slower as the map grows? Wall-clock time of the "
+        "estimator's own work for a frame, on the machine of the run.",
         drawing(traces, _SECONDS, "time (ms)", **_scales(log=True)),
+    )
+
+
+_STAGES = {
+    "load": "reading the images",
+    "sift": "SIFT features",
+    "watch": "watch over the cameras",
+    "predict": "prediction",
+    "stereo": "stereo matches",
+    "track": "tracking, matching, motion",
+    "places": "place recognition",
+    "update": "estimator's update",
+    "calibrate": "self-calibration",
+}
+"""Stages of the loop in words; that of waiting for images is no work."""
+
+
+def cost_by_stage(stages: Mapping[str, FloatArray], start: float) -> Figure:
+    """Milliseconds of each frame by stage, one over the other.
+
+    Args:
+        stages: `timestamp` and the stages' milliseconds, (n,) each.
+        start: of the drive, seconds.
+    """
+    rows = thinned(len(stages["timestamp"]), _MAX_POINTS_ALONG)
+    seconds = (stages["timestamp"] - start)[rows]
+    traces: list[Any] = []
+    for name, words in _STAGES.items():
+        spent = stages.get(name, np.zeros(1))
+        if (mean := spent.mean()) >= _LEAST_MS:
+            style = {"width": 0.8, "stackgroup": "all"}
+            tint = colour(len(traces))
+            traces.append(curve(f"{words}, {mean:.1f} ms", seconds, spent[rows], tint, **style))
+    whole = np.sum([stages[name] for name in _STAGES if name in stages], axis=0)
+    return Figure(
+        "stages",
+        "Cost of a frame by stage",
+        "Where does the time of a frame go? Wall-clock time of each stage of the live loop on the "
+        "machine of the run, one over the other; in the legend the means. Images are read and "
+        "SIFT features found in threads next to the loop.",
+        drawing(traces, _SECONDS, "time (ms)"),
+        note=f"median of all together {np.median(whole):.0f} ms, longest {whole.max():.0f} ms",
     )
 
 
@@ -660,8 +730,9 @@ def noise_over_time(data: ReportData) -> Figure:
     return Figure(
         "noise",
         "Noise estimated from the drive",
-        "Standard deviations in use in each frame. Rotation, translation: the acceleration by "
-        "which the camera's velocity is expected to change, where no odometry measures it. Times "
+        "How much noise did the drive itself show? Standard deviations in use in each frame. "
+        "Rotation, translation: the acceleration by which the camera's velocity is expected to "
+        "change, where no odometry measures it. Times "
         "the stated deviation: of a gyroscope's turns; of matches, where a frame's pose is found; "
         "in a graph, as measurements are weighed (solid: errors that persist from frame to frame "
         "count for more) and as a single one is judged (dashed).",
@@ -696,16 +767,19 @@ def calibration_over_time(found: Mapping[str, FloatArray], start: float) -> Figu
             values = found[f"{camera}_{change}"]
             bound = SIGMAS * found[f"{camera}_{change}_sigma"]
             name, of = f"{camera} camera", {"yaxis": _panel(k), "group": camera}
-            traces.append(band(f"{name}, 3 sigma", seconds, values - bound, values + bound, **of))
+            shade = {"fillcolor": f"{colour(i)}30", **of}
+            traces.append(
+                band(f"{name}, 3 sigma", seconds, values - bound, values + bound, **shade)
+            )
             style = {"width": 1.8, "showlegend": k == 0} | of
             traces.append(curve(name, seconds, values, colour(i), **style))
     knocks = int(found["knocks"][-1]) if len(seconds) else 0
     return Figure(
         "calibration",
         "The rig's calibration",
-        "How far the other cameras are turned and zoomed against the rig's calibration, as the "
-        "drive showed it. Band: three standard deviations; where it holds zero, the calibration "
-        "may be exact.",
+        "Was the rig still as calibrated? How far the other cameras are turned and zoomed against "
+        "the rig's calibration, as the drive showed it. Bands: three standard deviations; where "
+        "one holds zero, the calibration may be exact.",
         panels(traces, dict.fromkeys(_CHANGES.values(), _TO_ZERO)),
         note=f"The rig was found to have moved {knocks} times." if knocks else "",
     )

@@ -5,6 +5,7 @@ A frame takes milliseconds: every run draws some.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -143,6 +144,21 @@ def draw_flow(
     _put_text(below, legend, (_MARGIN_PX, 0.65 * _HEADING_PX))
     panel = _headed(panel, title or "Flow between frames", note)
     _write(path, np.concatenate([panel, below]))
+
+
+_VIEW_PX, _VIEW_QUALITY = 320, 60
+
+
+def draw_view(path: Path, image: Image) -> None:
+    """What a camera saw, small. Raises OutputError.
+
+    Args:
+        path: the JPEG to write.
+        image: (height, width) or (height, width, 3) uint8.
+    """
+    scale = min(1.0, _VIEW_PX / image.shape[1])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _write(path, np.asarray(small, np.uint8), [cv2.IMWRITE_JPEG_QUALITY, _VIEW_QUALITY])
 
 
 def draw_plan(path: Path, data: ReportData) -> None:
@@ -358,8 +374,11 @@ def _colours(parts: FloatArray) -> list[tuple[int, ...]]:
     return [tuple(row) for row in painted.reshape(-1, 3).astype(np.int64).tolist()]
 
 
-def _write(path: Path, canvas: Image) -> None:
-    # Level 1 takes a third of the time of 3, for a tenth more bytes.
-    packed = cv2.imencode(".png", canvas, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+# Level 1 takes a third of the time of 3, for a tenth more bytes.
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+def _write(path: Path, canvas: Image, how: Sequence[int] = _PNG) -> None:
+    packed = cv2.imencode(path.suffix, canvas, how)[1]
     with replacing(path) as partial:
         partial.write_bytes(packed.tobytes())

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from fgslam.core.files import write_text
 from fgslam.report import figures as drawn
-from fgslam.report.content import Page, Picture
+from fgslam.report.content import Drive, Page, Picture, plain
 from fgslam.report.results import EstimatorReport, ReportData
 
 MAX_WIDTH = 1100
@@ -72,7 +72,26 @@ def render(page: Page) -> str:
         draw=_DRAW,
         digests=(digest, _digest(_DRAW)),
         plotly=plotly,
-        figures=_packed(f"{{{', '.join(drawings)}}}"),
+        figures=_packed(f'{{"figures": {{{", ".join(drawings)}}}, "drive": {_moves(page.drive)}}}'),
+    )
+
+
+def _moves(drive: Drive | None) -> str:
+    """A drive as JSON; places to the millimetre, to keep the page small."""
+    if drive is None:
+        return "null"
+    return json.dumps(
+        plain(
+            {
+                "colours": drive.colours,
+                "seconds": drive.seconds.round(3),
+                "places": drive.places.round(3),
+                "views": [
+                    [step, f"data:image/jpeg;base64,{base64.b64encode(view).decode('ascii')}"]
+                    for step, view in drive.views.items()
+                ],
+            }
+        )
     )
 
 
@@ -174,6 +193,7 @@ def slam_page(data: ReportData) -> Page:
             drawn.error_by_axis(data),
             drawn.nees_over_time(data),
             drawn.time_per_frame(data),
+            *([] if data.stages is None else [drawn.cost_by_stage(data.stages, data.start)]),
             *(drawn.matches_over_time(e) for e in data.estimators[:1] if e.counts),
             *([drawn.noise_over_time(data)] if any(e.noise for e in data.estimators) else []),
             *([drawn.calibration_over_time(rig, data.start)] if rig is not None else []),
@@ -184,6 +204,9 @@ def slam_page(data: ReportData) -> Page:
         remarks=data.remarks,
         config_yaml=data.config_yaml,
         versions=data.versions,
+        about=data.about,
+        commands=data.commands,
+        drive=drawn.drive_along(data),
     )
 
 
@@ -193,7 +216,8 @@ def headline(data: ReportData) -> tuple[str, ...]:
     lines = [*data.alarms]
     lines += [_accuracy(data, working)] if working else ["No estimator gave a result."]
     lines += _consistency(working)
-    lines += dict.fromkeys(f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark)
+    # By how much, differs from one to the next: each has its own among the remarks.
+    lines += [f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark][:1]
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     return tuple(lines)
 

@@ -143,6 +143,10 @@ class ReportData:
         alignment: how the errors behind ``ate_m`` were aligned, in words.
         alarms: what makes the run no success, in sentences.
         calibration: (n,) each, the columns of calibration.csv; None where the run kept none.
+        stages: (n,) each, `timestamp` and milliseconds of every stage of the live loop.
+        views: small JPEG images of the reference camera by the row of the first estimator's path.
+        about: titles of estimators and what each is, in a sentence.
+        commands: what one may type next.
     """
 
     title: str
@@ -159,6 +163,10 @@ class ReportData:
     alignment: str = "SE3 aligned"
     alarms: tuple[str, ...] = ()
     calibration: Mapping[str, FloatArray] | None = None
+    stages: Mapping[str, FloatArray] | None = None
+    views: Mapping[int, bytes] = field(default_factory=dict)
+    about: tuple[tuple[str, str], ...] = ()
+    commands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         titles = [estimator.title for estimator in self.estimators]

@@ -10,6 +10,7 @@ import fcntl
 import hashlib
 import os
 import platform
+import shlex
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -290,3 +291,17 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+# ------------------------------------------------------------------------------------------
+# What one may do with a run
+
+
+def next_commands(folder: Path | str) -> tuple[str, ...]:
+    """Commands that take the run of SLAM in ``folder`` further, as they are typed."""
+    run = shlex.quote(str(folder))
+    return (
+        f"fgslam compare {run} --estimators landmark_kalman,isam2,batch",
+        f"fgslam export {run} --map map.ply --colour",
+        f"fgslam film {run} run.mp4",
+    )

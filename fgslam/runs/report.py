@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from fgslam.backend.self_calibration import SelfCalibration
+from fgslam.backend.settings import ESTIMATORS
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.files import make_subfolder
@@ -59,8 +60,14 @@ from fgslam.report.results import (
     truth_in_their_world,
 )
 from fgslam.runs.engine import LocatedShare
-from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.results import PICTURES
+from fgslam.runs.folder import (
+    CALIBRATION_FILE,
+    LOG_FILE,
+    REPORT_FILE,
+    RUN_MARKER,
+    next_commands,
+)
+from fgslam.runs.results import PICTURES, VIEW
 from fgslam.runs.tables import (
     FRAMES_FILE,
     NOISE_TABLE,
@@ -296,6 +303,11 @@ def read_closures(path: Path) -> tuple[TextTable, tuple[tuple[int, int], ...]]:
 # A folder read back for its page
 
 _UP = np.array([0.0, -1.0, 0.0])
+_LEDGER_COLUMNS = (
+    Column("taken as", "what figures rest on"),
+    Column("source", "where that is stated, or how it was guessed"),
+    Column("changed by", "the option that states otherwise"),
+)
 COUNTS = ("matched", "inliers", "landmarks")
 """Columns of frames.csv that the page draws."""
 _MOST_NOTES = 20
@@ -399,12 +411,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
             (e.what, (e.value, "guessed: " * e.guessed + e.source, e.option or "-"))
             for e in entries
         )
-        columns = (
-            Column("taken as", "what figures rest on"),
-            Column("source", "where that is stated, or how it was guessed"),
-            Column("changed by", "the option that states otherwise"),
-        )
-        tables.append(TextTable("ledger", "What the figures rest on", "", columns, rows))
+        tables.append(TextTable("ledger", "What the figures rest on", "", _LEDGER_COLUMNS, rows))
     provenance = _section(config, "provenance")
     dataset = str(_section(provenance, "dataset").get("name") or "")
     frames, odometry = metrics.get("frames"), metrics.get("odometry")
@@ -438,7 +445,30 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         alignment="after SE3 alignment",
         alarms=alarms(found, (steered or {}).get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
+        stages=None if (file := find("timing.csv")) is None else _stages(file),
+        views={
+            int(path.stem.rpartition("_")[2]): path.read_bytes()
+            for path in pictures.glob(f"{VIEW}_*.jpg")
+        },
+        about=tuple((one.title, _kind_in_words(one.kind)) for one in estimators),
+        commands=next_commands(folder.resolve().name) if find(LOG_FILE) else (),
     )
+
+
+def _kind_in_words(kind: str) -> str:
+    """What an estimator of a kind is, in a sentence: as its settings say."""
+    return (getattr(ESTIMATORS.get(kind), "__doc__", None) or "").partition("\n")[0]
+
+
+def _stages(path: Path) -> dict[str, FloatArray] | None:
+    """A column of milliseconds for every stage of timing.csv, one row a frame."""
+    table = read_table(path, ("timestamp", "milliseconds"), ("stage",))
+    names = dict.fromkeys(table["stage"].tolist())
+    rows = {name: table["stage"] == name for name in names}
+    if len({int(own.sum()) for own in rows.values()}) != 1:
+        return None
+    stages = {name: table["milliseconds"][own] for name, own in rows.items()}
+    return {"timestamp": table["timestamp"][next(iter(rows.values()))], **stages}
 
 
 def _read_config(path: Path | None) -> tuple[str, dict[str, Any]]:

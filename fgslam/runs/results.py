@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PICTURES = "pictures"
+VIEW = "view"
+"""Beginning of the names of small pictures of the drive, before the row of its path."""
 UNKNOWN = "-"
 
 

@@ -102,6 +102,9 @@ def full_report(frames: int = 60, landmarks: int = 300) -> ReportData:
         pictures=(Picture("flow in frame 60", picture(rng)),),
         config_yaml="name: loop\n",
         versions={"fgslam": "0.1", "open3d": None},
+        views={0: picture(rng)},
+        about=(("isam2", "iSAM2 over all poses and landmarks."),),
+        commands=("fgslam film loop run.mp4",),
     )
 
 

@@ -12,6 +12,7 @@ from browser import LAPTOP, PHONE, WIDE, Browser, browsing
 from reports import HOSTILE, estimator_report, full_report, loop, without_truth
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
 from fgslam.report.content import ON_LIGHT, Picture
 from fgslam.report.page import write_report
@@ -129,6 +130,24 @@ def test_a_picture_opens_large_and_closes(browser: Browser) -> None:
     browser.wait(f"{width} > 1.5 * {small}")
     summary.click()
     browser.wait(f"{width} === {small}")
+
+
+def test_the_slider_moves_map_errors_and_image_by_keyboard(browser: Browser, page: Path) -> None:
+    def scroll_to(figure: str) -> None:
+        browser.driver.execute_script(f"document.getElementById('plot-{figure}').scrollIntoView()")
+
+    scroll_to("above")
+    now = f"{DRAWN.format('above')}.at(-1)"
+    end = full_report().estimators[1].final_poses[-1, 2, 3]
+    assert browser.js(f"{now}.y[1]") == pytest.approx(end, abs=1e-3)
+    step = browser.driver.find_element(By.ID, "step")
+    browser.repeat(lambda: step.send_keys(Keys.HOME), f"{now}.y[1] === 0")
+    assert browser.js("document.getElementById('when').value") == "0.00 s"
+    assert browser.js("document.getElementById('view').src").startswith("data:image/jpeg;base64,")
+    step.send_keys(Keys.ARROW_RIGHT)
+    browser.wait("document.getElementById('when').value === '0.25 s'")
+    scroll_to("error")
+    browser.wait("document.getElementById('plot-error').layout.shapes?.[0]?.x0 === 0.25")
 
 
 def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:

@@ -40,11 +40,12 @@ from fgslam.report.content import (
     Column,
     TextTable,
     sentence,
+    thinned,
     write_csv,
     write_metrics,
     write_timing,
 )
-from fgslam.report.overlays import draw_disparities, draw_features, draw_flow
+from fgslam.report.overlays import draw_disparities, draw_features, draw_flow, draw_view
 from fgslam.runs.config import Experiment, ExperimentConfig, parse
 from fgslam.runs.engine import LocatedShare
 from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE, METRICS_FILE
@@ -59,7 +60,7 @@ from fgslam.runs.report import (
     run_numbers,
     write_closures,
 )
-from fgslam.runs.results import PICTURES
+from fgslam.runs.results import PICTURES, VIEW
 from fgslam.runs.session import drives_of, map_points
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tables import (
@@ -722,17 +723,25 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     return tuple(lines)
 
 
-def frames_to_show(count: int) -> frozenset[int]:
-    """Which of ``count`` frames are drawn: the first and the middle."""
-    return frozenset({0, count // 2})
+_VIEWS = 24
 
 
 def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
-    """Features (Fig. 1) of a first frame; of others disparities (Fig. 2) and flow (Fig. 3)."""
-    if report.found.frame is None:
+    """Pictures of the sequence's frame ``i``, where it is one of those that are drawn.
+
+    Views of frames evenly spread; features (Fig. 1) of the first; disparities (Fig. 2) and flow
+    (Fig. 3) of the middle one.
+    """
+    count = len(outputs.sequence)
+    view, drawn = i in thinned(count, _VIEWS), i in (0, count // 2)
+    if report.found.frame is None or not (view or drawn):
         return
     folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
+    if view:
+        draw_view(folder / f"{VIEW}_{len(outputs.recorder) - 1:06d}.jpg", images[0])
+    if not drawn:
+        return
     predicted = predicted_poses(outputs.recorder.column("status").tolist())  # so far
     what = f"{outputs.config.name}: frame {report.increment.index}"
     title = picture_title(what, int(predicted.sum()), bool(outputs.remark))

@@ -15,10 +15,12 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import so3_exp
 from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer
-from fgslam.report.content import Figure
+from fgslam.report.content import Figure, level_axes
 from fgslam.report.figures import (
     Detail,
     calibration_over_time,
+    cost_by_stage,
+    drive_along,
     drive_from_above,
     error_by_axis,
     error_over_time,
@@ -266,3 +268,45 @@ def test_unknown_quantities_have_no_panel() -> None:
     assert not [t for t in figure.data if t.name == "truth"]
     blind = dataclasses.replace(estimate(0.1), covariances=np.full((FRAMES, 6, 6), np.nan))
     assert {trace.yaxis for trace in plot({"a": blind}).data} == {"y"}
+
+
+# --------------------------------------------------------------------------------------------
+# Along the drive
+
+
+def test_the_slider_is_where_the_paths_are() -> None:
+    data = dataclasses.replace(full_report(60), views={0: b"first", 30: b"middle"})
+    drive = drive_along(data)
+    assert drive is not None
+    first = data.estimators[0]
+    np.testing.assert_allclose(drive.seconds, first.timestamps - data.start)
+    world = drive.places[0] @ level_axes(data.up)
+    np.testing.assert_allclose(world, first.final_poses[:, :3, 3], atol=1e-12)
+    assert np.isnan(drive.places[2]).all()  # the one that failed
+    assert drive.views == {0: b"first", 30: b"middle"}
+
+
+def test_a_long_drive_is_moved_along_in_few_steps() -> None:
+    data = dataclasses.replace(full_report(1000), views={0: b"first", 999: b"last"})
+    drive = drive_along(data)
+    assert drive is not None
+    assert len(drive.seconds) == drive.places.shape[1] == 300
+    assert drive.views == {0: b"first", 299: b"last"}
+    assert drive_along(ReportData("t", "", ())) is None
+
+
+def test_cost_by_stage_holds_all_but_waiting() -> None:
+    stages = {
+        "timestamp": 10.0 + np.arange(4.0),
+        "wait": np.full(4, 50.0),
+        "sift": np.array([40.0, 0.0, 0.0, 0.0]),
+        "track": np.full(4, 5.0),
+        "places": np.zeros(4),
+    }
+    figure = cost_by_stage(stages, 10.0)
+    assert [trace.name for trace in figure.drawing.data] == [
+        "SIFT features, 10.0 ms",
+        "tracking, matching, motion, 5.0 ms",
+    ]
+    np.testing.assert_allclose(figure.drawing.data[0].x, np.arange(4.0))
+    assert figure.note == "median of all together 5 ms, longest 45 ms"
