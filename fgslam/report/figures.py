@@ -495,7 +495,7 @@ def error_over_time(data: ReportData) -> Figure:
     """Distance from the true position, final and online, next to what the estimator claims."""
     traces: list[Any] = []
     for i, one in enumerate(data.estimators):
-        claimed = SIGMAS * position_sigma(one)
+        claimed = SIGMAS * one.position_sigma_m
         traces += _over_time(data, i, "3 sigma", claimed, " m", width=1.2, dash="dash")
         online, style = one.online_error_m, {"dash": "dot", "shown": False}
         traces += _over_time(data, i, "as first estimated", online, " m", **style)
@@ -517,13 +517,6 @@ def error_over_time(data: ReportData) -> Figure:
         missing=_missing(data),
         note="" if finals else "Errors are not known: only what the estimators claim is drawn.",
     )
-
-
-def position_sigma(estimator: EstimatorReport) -> FloatArray:
-    """Root of the summed variances of each final position (n,), metres; NaN where unknown."""
-    variance = np.trace(estimator.covariances[:, 3:, 3:], axis1=1, axis2=2)
-    # A planar covariance may round to just below zero.
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def error_by_axis(data: ReportData) -> Figure:

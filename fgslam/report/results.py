@@ -96,6 +96,13 @@ class EstimatorReport:
         """The path as estimated at the end."""
         return Trajectory(self.timestamps, self.final_poses)
 
+    @property
+    def position_sigma_m(self) -> FloatArray:
+        """Root of the summed variances of each final position (n,); NaN where unknown."""
+        variance = np.trace(self.covariances[:, 3:, 3:], axis1=1, axis2=2)
+        # A planar covariance may round to just below zero.
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
     @staticmethod
     def unjudged(title: str, kind: str, estimate: Estimate) -> EstimatorReport:
         """An estimate of which neither errors nor times nor first estimates are known."""

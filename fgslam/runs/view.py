@@ -459,9 +459,24 @@ def _log(rerun: Any, stream: Any, data: ReportData) -> None:
         kind = "image/png" if picture.content.startswith(b"\x89PNG") else "image/jpeg"
         image = rerun.EncodedImage(contents=picture.content, media_type=kind)
         stream.log(f"pictures/{i:02d}", image, static=True)
+    for row, view in sorted(data.views.items()):
+        stream.set_time(TIMELINE, duration=data.estimators[0].timestamps[row] - data.start)
+        stream.log("view", rerun.EncodedImage(contents=view, media_type="image/jpeg"))
     captions = "\n".join(f"{i:02d}: {picture.caption}" for i, picture in enumerate(data.pictures))
     parts = [data.title, data.subtitle, *data.notes, *data.remarks, captions, data.config_yaml]
     stream.log("about", rerun.TextDocument("\n\n".join(filter(None, parts))), static=True)
+    # The map on the left; image, error with its band, consistency and words on the right.
+    views = rerun.blueprint
+    right = views.Vertical(
+        views.Spatial2DView(origin="view", name="what the reference camera saw"),
+        views.TimeSeriesView(origin="error_m", name="position error and three sigma (m)"),
+        views.TimeSeriesView(origin="nees_per_dof", name="NEES per degree of freedom"),
+        views.TextDocumentView(origin="about", name="about"),
+    )
+    layout = views.Horizontal(
+        views.Spatial3DView(origin="world", name="map"), right, column_shares=[3, 2]
+    )
+    stream.send_blueprint(views.Blueprint(layout, collapse_panels=True))
 
 
 def _log_estimator(
@@ -481,15 +496,18 @@ def _log_estimator(
     if len(centres):
         shapes = _ellipsoids(rerun, centres, covariances, colour)
         stream.log([*place, "three_sigma"], shapes, static=True)
-    for name, values in (
-        ("error_m", estimator.final_error_m),
-        ("online_error_m", estimator.online_error_m),
-        ("nees_per_dof", estimator.nees),
-        ("update_ms", estimator.update_ms),
+    claimed = _SIGMAS * estimator.position_sigma_m
+    for name, part, values, width in (
+        ("error_m", "", estimator.final_error_m, 2.0),
+        ("error_m", ", three sigma", claimed, 0.7),
+        ("online_error_m", "", estimator.online_error_m, 2.0),
+        ("nees_per_dof", "", estimator.nees, 2.0),
+        ("update_ms", "", estimator.update_ms, 2.0),
     ):
         if (there := np.isfinite(values)).any():
-            entity = rerun.new_entity_path([name, estimator.title])
-            style = rerun.SeriesLines(colors=[colour], names=[estimator.title])
+            title = f"{estimator.title}{part}"
+            entity = rerun.new_entity_path([name, title])
+            style = rerun.SeriesLines(colors=[colour], names=[title], widths=[width])
             stream.log(entity, style, static=True)
             times = rerun.TimeColumn(TIMELINE, duration=estimator.timestamps[there] - start)
             columns = rerun.Scalars.columns(scalars=values[there])
@@ -535,11 +553,11 @@ class Watcher:
         self._send_pose(stats.wTc, stats.covariance)
         self._send_map(outputs.pipeline.estimator.landmarks(), increment)
         for name, value in (
-            ("matched", int(report.tracking.inliers.sum())),
-            ("landmarks", stats.landmarks),
+            ("numbers/matched", int(report.tracking.inliers.sum())),
+            ("numbers/landmarks", stats.landmarks),
             ("sigma_m", float(np.sqrt(np.trace(stats.covariance[3:, 3:])))),
         ):
-            stream.log(f"numbers/{name}", rerun.Scalars([value]))
+            stream.log(name, rerun.Scalars([value]))
         status = report.tracking.status
         sound = status.measured or status is EgoMotionStatus.FIRST
         text = rerun.TextLog(status_line(report), level="INFO" if sound else "WARN")
@@ -551,9 +569,10 @@ class Watcher:
         _log_world(rerun, stream, vertical_of(rig.bTc))
         lens = rerun.Pinhole(focal_length=[rig.fx, rig.fy], width=rig.width, height=rig.height)
         stream.log(f"{_WORLD}/camera", lens, static=True)
-        for name, colour in (("matched", _KEPT), ("landmarks", _ESTIMATE), ("sigma_m", _REJECTED)):
-            style = rerun.SeriesLines(colors=[colour], names=[name])
-            stream.log(f"numbers/{name}", style, static=True)
+        of = {"numbers/matched": _KEPT, "numbers/landmarks": _ESTIMATE, "sigma_m": _REJECTED}
+        for name, colour in of.items():
+            style = rerun.SeriesLines(colors=[colour], names=[name.removeprefix("numbers/")])
+            stream.log(name, style, static=True)
         views = rerun.blueprint
         images = [
             views.Spatial2DView(origin=f"cameras/{name}", name=name)
@@ -564,7 +583,8 @@ class Watcher:
             views.Spatial3DView(origin="world", name="map"),
             views.Vertical(
                 views.Horizontal(*images),
-                views.TimeSeriesView(origin="numbers", name="numbers"),
+                views.TimeSeriesView(origin="numbers", name="landmarks matched, and in the map"),
+                views.TimeSeriesView(origin="sigma_m", name="sigma of the position (m)"),
                 views.TextLogView(origin="status", name="status"),
             ),
         )

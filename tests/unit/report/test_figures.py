@@ -28,7 +28,6 @@ from fgslam.report.figures import (
     nees_over_time,
     noise_over_time,
     plot,
-    position_sigma,
 )
 from fgslam.report.results import ReportData
 
@@ -102,7 +101,7 @@ def test_ellipses_that_would_hide_the_view_wait_until_asked_for() -> None:
 def test_covariances_that_are_not_known_have_no_ellipse() -> None:
     data = with_values(full_report(), covariances=np.full((60, 6, 6), np.nan))
     assert not len(named(drive_from_above(data), "isam2, 3 sigma").x)
-    assert np.isnan(position_sigma(data.estimators[0])).all()
+    assert np.isnan(data.estimators[0].position_sigma_m).all()
 
 
 def test_large_maps_and_long_runs_are_thinned_with_a_note() -> None:
