@@ -313,7 +313,7 @@ _BLOCK = 1024
 _MOVED_M = 1e-3  # the viewer shows rooms and streets
 _PATH_BLOCK = 64
 _JPEG_QUALITY = 75
-_DOT = 2.0  # points of the screen
+_DOT, _NOW = 2.0, 6.0  # points of the screen: a landmark, where a path is now
 WHITE, _KEPT, _REJECTED, _NEW = (235, 235, 235), (60, 220, 90), (255, 80, 80), (90, 170, 255)
 
 
@@ -490,12 +490,19 @@ def _log_estimator(
             line = rerun.LineStrips3D([known], colors=[colour])
             stream.log([*place, name], line, static=True)
     if len(estimator.landmarks):
-        dots = rerun.Points3D(estimator.landmarks.positions, colors=[colour], radii=[0.01])
+        radii = [rerun.Radius.ui_points(_DOT)]
+        dots = rerun.Points3D(estimator.landmarks.positions, colors=[colour], radii=radii)
         stream.log([*place, "landmarks"], dots, static=True)
     centres, covariances = claimed_positions(estimator)
     if len(centres):
         shapes = _ellipsoids(rerun, centres, covariances, colour)
         stream.log([*place, "three_sigma"], shapes, static=True)
+    seconds = estimator.timestamps - start
+    now = rerun.new_entity_path([*place, "now"])
+    style = rerun.Points3D.from_fields(colors=[colour], radii=[rerun.Radius.ui_points(_NOW)])
+    stream.log(now, style, static=True)
+    places = rerun.Points3D.columns(positions=estimator.final_poses[:, :3, 3])
+    stream.send_columns(now, [rerun.TimeColumn(TIMELINE, duration=seconds)], places)
     claimed = _SIGMAS * estimator.position_sigma_m
     for name, part, values, width in (
         ("error_m", "", estimator.final_error_m, 2.0),
@@ -509,7 +516,7 @@ def _log_estimator(
             entity = rerun.new_entity_path([name, title])
             style = rerun.SeriesLines(colors=[colour], names=[title], widths=[width])
             stream.log(entity, style, static=True)
-            times = rerun.TimeColumn(TIMELINE, duration=estimator.timestamps[there] - start)
+            times = rerun.TimeColumn(TIMELINE, duration=seconds[there])
             columns = rerun.Scalars.columns(scalars=values[there])
             stream.send_columns(entity, [times], columns)
 
