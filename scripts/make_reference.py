@@ -6,10 +6,12 @@ stale.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from textwrap import TextWrapper
 
 import typer
 from typer.core import TyperArgument, TyperOption
@@ -37,9 +39,18 @@ TUTORIALS = {
 }
 """Tutorials made from several examples: the page's title, and the examples in order."""
 
+LIVE = ("live_robot", "ros2_node")
+"""Examples that need a stream of images: they are no notebooks."""
+
+_LINES = TextWrapper(110, drop_whitespace=False, subsequent_indent="    ")
+"""What is printed fits a page; spaces stay, for they align tables."""
+
 _CELL = re.compile(r"^# %%(?P<kind> \[markdown\])?.*\n", re.MULTILINE)
 _NOTE = "<!-- Made by `python -m scripts.make_reference` from examples/{}: edit that. -->"
 _END = """Run it: `python examples/{}` (a notebook in VS Code, by jupytext in Jupyter).
+"""
+_NOTEBOOK = """Run it: `python examples/{0}.py`; or open
+[the notebook](../notebooks/{0}.ipynb), which has these outputs.
 """
 
 _INTRODUCTION = """# Command line
@@ -144,18 +155,48 @@ def tutorial_page(name: str) -> str:
     Raises:
         ValueError: the example does not begin with a text cell and a title.
     """
+    parts = [_cell(body, text) for body, text in cells_of(name)]
+    last = _END.format(f"{name}.py")
+    if notebook_of(name).is_file():
+        last = _NOTEBOOK.format(name)
+        printed = _printed(name)
+        parts = [part + printed.get(k, "") for k, part in enumerate(parts)]
+    title, _, rest = parts[0].partition("\n")
+    head = [title, _NOTE.format(f"{name}.py"), rest.strip()]
+    return "\n\n".join([*head, *parts[1:], last])
+
+
+def cells_of(name: str) -> list[tuple[str, bool]]:
+    """The cells of an example, and whether each is text. Raises ValueError without a first one."""
     source = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
     marks = list(_CELL.finditer(source))
     if not marks or marks[0].start() != 0 or not marks[0]["kind"]:
         raise ValueError(f"examples/{name}.py: begin with `# %% [markdown]` and a title")
     ends = [*(mark.start() for mark in marks[1:]), len(source)]
-    parts = [
-        _cell(source[mark.end() : end].strip(), text=mark["kind"] is not None)
+    return [
+        (source[mark.end() : end].strip(), mark["kind"] is not None)
         for mark, end in zip(marks, ends, strict=True)
     ]
-    title, _, rest = parts[0].partition("\n")
-    head = [title, _NOTE.format(f"{name}.py"), rest.strip()]
-    return "\n\n".join([*head, *parts[1:], _END.format(f"{name}.py")])
+
+
+def notebook_of(name: str) -> Path:
+    """Where the notebook of an example is kept."""
+    return DOCS / "notebooks" / f"{name}.ipynb"
+
+
+def _printed(name: str) -> dict[int, str]:
+    """What each cell of a notebook prints, in a fenced block, by its number."""
+    out = {}
+    for k, cell in enumerate(json.loads(notebook_of(name).read_text(encoding="utf-8"))["cells"]):
+        texts = ["".join(one.get("text", "")) for one in cell.get("outputs", ())]
+        lines = [
+            part.rstrip()
+            for line in "".join(texts).splitlines()
+            for part in _LINES.wrap(line) or [""]
+        ]
+        if lines:
+            out[k] = "\n".join(["\n\n```text", *lines, "```"])
+    return out
 
 
 def joined_tutorials(page: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -10,7 +11,16 @@ import typer
 from fgslam.cli.main import app
 from fgslam.runs.config import HOMING_TASKS, TASKS, ExperimentConfig
 from scripts import reference_experiments, reference_settings
-from scripts.make_reference import DOCS, commands_of, commands_page, pages
+from scripts.make_reference import (
+    DOCS,
+    EXAMPLES,
+    LIVE,
+    cells_of,
+    commands_of,
+    commands_page,
+    notebook_of,
+    pages,
+)
 from scripts.reference_experiments import unreasoned
 from scripts.reference_settings import WIDTH, item, settings_page
 
@@ -116,3 +126,12 @@ def test_items_break_between_words_but_not_in_code() -> None:
     assert max(map(len, lines)) <= WIDTH
     assert lines[0].startswith("- `a key with a long name`: word")
     assert lines[1].startswith("  word")
+
+
+@pytest.mark.parametrize("name", sorted({p.stem for p in EXAMPLES.glob("*.py")} - {*LIVE}))
+def test_the_notebook_of_an_example_has_its_code_and_what_it_prints(name: str) -> None:
+    cells = json.loads(notebook_of(name).read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    stale = f"stale: run python -m scripts.make_notebooks {name}"
+    assert code == [body for body, text in cells_of(name) if not text], stale
+    assert any(one.get("name") == "stdout" for cell in cells for one in cell.get("outputs", ()))

@@ -1,0 +1,46 @@
+"""Runs the examples as notebooks, and keeps them with what they print in docs/notebooks.
+
+    pip install -e '.[notebooks]'
+    python -m scripts.make_notebooks [NAME ...]
+
+Then `python -m scripts.make_reference` sets what they print below the code of the tutorials.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from tempfile import TemporaryDirectory
+
+import jupytext
+import nbformat
+from nbclient import NotebookClient
+
+from scripts.make_reference import EXAMPLES, LIVE, notebook_of
+
+
+def make(name: str) -> None:
+    """Writes one notebook; times and identities that differ from run to run are left out."""
+    notebook = jupytext.read(EXAMPLES / f"{name}.py")
+    with TemporaryDirectory() as folder:
+        client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": folder}})
+        client.execute(cwd=folder)
+    for k, cell in enumerate(notebook.cells):
+        for one in cell.get("outputs", ()):  # Open3D greets Jupyter
+            one.text = re.sub(
+                r"^(Jupyter environment|\[Open3D INFO\]).*\n", "", one.text, flags=re.M
+            )
+        cell.id, cell.metadata = f"{name}-{k}".replace("_", "-"), {}
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook.metadata = {"kernelspec": kernel}
+    path = notebook_of(name)
+    path.parent.mkdir(exist_ok=True)
+    text = nbformat.writes(notebook)  # type: ignore[no-untyped-call]
+    path.write_text(f"{text}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    names = [path.stem for path in sorted(EXAMPLES.glob("*.py")) if path.stem not in LIVE]
+    for name in sys.argv[1:] or names:
+        make(name)
+        print(f"{notebook_of(name)}: written")
