@@ -21,7 +21,6 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.elimination import (
     Border,
     Bordered,
-    ChainMarginals,
     GraphMarginals,
     LinearSystem,
     SolvedSystem,
@@ -701,7 +700,7 @@ class Descent:
         """No step yet; whether it keeps the system."""
         self._keeps = keeps
         self._damping = Damping()
-        self._held: GraphMarginals | ChainMarginals | None = None
+        self._held: GraphMarginals | None = None
 
     def step(
         self, graph: WholeGraph, cost: float, state: State, last_gain: float
@@ -728,7 +727,7 @@ class Descent:
         graph: WholeGraph,
         state: State,
         system: LinearSystem,
-        held: GraphMarginals | ChainMarginals,
+        held: GraphMarginals,
     ) -> tuple[float, State] | None:
         """The step by a kept system; None where a landmark has become undetermined."""
         try:

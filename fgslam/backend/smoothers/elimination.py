@@ -1,8 +1,9 @@
-"""Marginal covariances of a whole graph at once, from its reduced pose system.
+"""Marginal covariances of a whole graph at once, by sparse elimination of poses and landmarks.
 
 One by one, GTSAM's marginals of 4,000 landmarks take 25 s. Here landmarks are eliminated first, all
-together (their block of the information matrix is block-diagonal, 3x3 each), the poses' dense
-system is inverted, and each landmark takes its own covariance back from the poses that saw it.
+together (their block of the information matrix is block-diagonal, 3x3 each), the poses' sparse
+system is inverted where poses are linked, and each landmark takes its own covariance back from the
+poses that saw it. Where landmarks are few and seen long, they stay in that system.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack, solve_triangular
+from scipy.linalg import blas, lapack, solve_triangular
 from scipy.sparse import block_array, bsr_matrix, csc_matrix, csr_matrix, diags_array, identity
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import splu
@@ -27,6 +28,7 @@ from fgslam.factors.landmark import summed
 # Sparse systems of poses in blocks of 6 x 6: solved, and inverted where poses are linked
 
 UNDETERMINED = "the measurements do not determine all variables; no covariances"
+_ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
 _SPARE = 0.3  # of a group's blocks may be zeros that a smaller group would not hold
 
 
@@ -57,8 +59,12 @@ class BlockCholesky:
     Without the scaling, digits would be lost next to poses that are held stiffly.
     """
 
-    def __init__(self, matrix: bsr_matrix) -> None:
+    def __init__(self, matrix: bsr_matrix, first: IntArray | None = None) -> None:
         """Takes a matrix (6n, 6n) in blocks of 6 x 6 apart.
+
+        Args:
+            matrix: what is factored.
+            first: (k,) rows of blocks that are eliminated before all others, in this order.
 
         Raises:
             EstimatorError: it is not positive definite.
@@ -69,7 +75,7 @@ class BlockCholesky:
             raise EstimatorError(UNDETERMINED)
         self._scale = np.sqrt(diagonal).reshape(n, 6)
         links = csr_matrix((np.ones(len(matrix.indices)), matrix.indices, matrix.indptr), (n, n))
-        self._place = least_degree(links)
+        self._place = least_degree(links) if first is None else _least_degree_after(first, links)
         self._groups = groups_of(links, self._place)
         self._own: list[FloatArray] = []
         self._below: list[FloatArray] = []
@@ -83,13 +89,13 @@ class BlockCholesky:
         factors = list(zip(self._groups, self._own, self._below, strict=True))
         for group, own, below in factors:
             at = slice(group.start, group.stop)
-            here = solve_triangular(own, x[at].reshape(-1, k), lower=True, check_finite=False)
+            here = blas.dtrsm(1.0, own, x[at].reshape(-1, k), lower=1)
             x[at] = here.reshape(-1, 6, k)
             x[group.rows] -= (below @ here).reshape(-1, 6, k)
         for group, own, below in reversed(factors):
             at = slice(group.start, group.stop)
             here = x[at].reshape(-1, k) - below.T @ x[group.rows].reshape(-1, k)
-            here = solve_triangular(own, here, lower=True, trans=1, check_finite=False)
+            here = blas.dtrsm(1.0, own, here, lower=1, trans_a=1)
             x[at] = here.reshape(-1, 6, k)
         return np.asarray((x[self._place] / self._scale[:, :, None]).reshape(6 * n, k))
 
@@ -115,14 +121,14 @@ class BlockCholesky:
             full[at, :, column[some] - group.start, :] = data[some]
             flat = full.reshape(6 * len(front), 6 * len(front))
             for rows, update in waiting.pop(number, []):
-                among = _expanded(np.searchsorted(front, rows))
-                flat[among[:, None], among] += update
+                for own_row, row_there, own_column, column_there in _slices(front, rows):
+                    flat[row_there, column_there] += update[own_row, own_column]
             own, status = lapack.dpotrf(flat[:size, :size], lower=1, clean=1)
-            if status != 0:
+            if status != 0 or own.diagonal().min() ** 2 < _ROUNDING:
                 raise EstimatorError(UNDETERMINED)
             below = flat[size:, :size]
             if len(group.rows):
-                below = solve_triangular(own, below.T, lower=True, check_finite=False).T
+                below = blas.dtrsm(1.0, own, below.T, lower=1).T
                 update = flat[size:, size:] - below @ below.T
                 waiting.setdefault(group.parent, []).append((group.rows, update))
             self._own.append(own)
@@ -154,12 +160,16 @@ class BlockCholesky:
             whole[:size, :size] = inverse + np.tril(inverse, -1).T
             if len(group.rows):
                 parent = self._groups[group.parent]
-                among = _expanded(np.searchsorted(parent.front, group.rows))
-                rest = known[group.parent][among[:, None], among]
-                gain = solve_triangular(
-                    self._own[number], self._below[number].T, lower=True, trans=1
+                rest, there = whole[size:, size:], known[group.parent]
+                for own_row, row_there, own_column, column_there in _slices(
+                    parent.front, group.rows
+                ):
+                    rest[own_row, own_column] = there[row_there, column_there]
+                    rest[own_column, own_row] = there[column_there, row_there]
+                gain = blas.dtrsm(
+                    1.0, self._own[number], self._below[number].T, lower=1, trans_a=1
                 ).T
-                whole[size:, size:], whole[size:, :size] = rest, -rest @ gain
+                whole[size:, :size] = -rest @ gain
                 whole[:size, size:] = whole[size:, :size].T
                 whole[:size, :size] -= gain.T @ whole[size:, :size]
             if first.get(group.parent) == number:  # no group needs it any more
@@ -172,9 +182,18 @@ class BlockCholesky:
         return np.concatenate(names[::-1]), np.concatenate(blocks[::-1])
 
 
-def _expanded(places: IntArray) -> IntArray:
-    """Rows of blocks of six."""
-    return (6 * places[:, None] + np.arange(6)).ravel()
+def _slices(front: IntArray, rows: IntArray) -> Iterator[tuple[slice, slice, slice, slice]]:
+    """Where poses (r,) are in a front: pieces of their matrix in one piece there, but those above.
+
+    Of each: own rows, rows there, own columns, columns there.
+    """
+    at, runs = np.searchsorted(front, rows), list[tuple[slice, slice]]()
+    for run in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(at) != 1) + 1):
+        first, last, there = int(run[0]), int(run[-1]) + 1, int(at[run[0]])
+        runs.append((slice(6 * first, 6 * last), slice(6 * there, 6 * (there + last - first))))
+    for number, row in enumerate(runs):
+        for column in runs[: number + 1]:
+            yield *row, *column
 
 
 def least_degree(links: csr_matrix) -> IntArray:
@@ -191,6 +210,19 @@ def least_degree(links: csr_matrix) -> IntArray:
         options={"SymmetricMode": True},
     )
     return np.asarray(found.perm_c, np.int64)
+
+
+def _least_degree_after(first: IntArray, links: csr_matrix) -> IntArray:
+    """The same of what is left when rows (k,) have come first."""
+    place, chosen = np.empty(links.shape[0], np.int64), links[first]
+    rest = np.setdiff1d(np.arange(len(place)), first)
+    # A row that is linked with the next one depends on what that depends on.
+    alone = np.cumsum(np.append(True, chosen[:, first].diagonal(1)[: len(first) - 1] == 0.0)) - 1
+    joined = csr_matrix((np.ones(len(first)), (alone, np.arange(len(first)))))
+    seen = (joined @ chosen)[:, rest]
+    place[first] = np.arange(len(first))
+    place[rest] = len(first) + least_degree((links[rest][:, rest] + seen.T @ seen).tocsr())
+    return place
 
 
 def groups_of(links: csr_matrix, place: IntArray) -> list[Group]:
@@ -347,9 +379,7 @@ class Bordered:
 
 
 # ------------------------------------------------------------------------------------------
-# Dense symmetric systems: a scaled Cholesky factor, and the inverse in its place
-
-_ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
+# Dense symmetric systems: a scaled Cholesky factor, and the inverse
 
 
 class UndeterminedError(EstimatorError):
@@ -361,52 +391,15 @@ class UndeterminedError(EstimatorError):
         self.row = row
 
 
-class DenseFactor:
-    """A positive definite matrix, factored in its own place, and later inverted there.
-
-    It may be the largest thing in memory by far: there is never a second one.
-    """
-
-    def __init__(self, matrix: FloatArray) -> None:
-        """Takes a matrix (n, n), which is overwritten.
-
-        Raises:
-            UndeterminedError: it is not positive definite.
-        """
-        self._held, self._size = scaled_cholesky(matrix, in_place=True)
-        self._inverted = False
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """The matrix' inverse times (n,) or (n, c)."""
-        if self._inverted:
-            return np.asarray(self._held @ right)
-        scale = self._size if right.ndim == 1 else self._size[:, None]
-        found = cho_solve((self._held, True), right / scale, check_finite=False)
-        return np.asarray(found / scale)
-
-    @property
-    def inverse(self) -> FloatArray:
-        """(n, n), which takes the factor's place when it is first asked for."""
-        if not self._inverted:
-            self._held = from_cholesky(self._held, self._size, in_place=True)
-            self._inverted = True
-        return self._held
-
-
-def scaled_cholesky(
-    information: FloatArray, in_place: bool = False
-) -> tuple[FloatArray, FloatArray]:
+def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
 
-    Without the scaling, digits would be lost next to poses that are held stiffly. A large matrix is
-    better overwritten.
+    Without the scaling, digits would be lost next to poses that are held stiffly.
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
         raise UndeterminedError(int(np.argmin(size > 0.0)), UNDETERMINED)
-    scaled = information if in_place else information.copy()
-    scaled /= size[:, None]
-    scaled /= size
+    scaled = information / size[:, None] / size
     factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
     if status != 0:
         raise UndeterminedError(int(status) - 1, UNDETERMINED)
@@ -416,16 +409,12 @@ def scaled_cholesky(
     return factor, size
 
 
-def from_cholesky(factor: FloatArray, size: FloatArray, in_place: bool = False) -> FloatArray:
-    """The inverse of the matrix that :func:`scaled_cholesky` took apart; in place of the factor."""
+def from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
+    """The inverse of the matrix that :func:`scaled_cholesky` took apart."""
     if not len(size):  # LAPACK would complain on the terminal
         return np.zeros((0, 0))
-    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=in_place)
-    for row in range(len(size)):  # in place: it may be large
-        inverse[row, row + 1 :] = inverse[row + 1 :, row]
-    inverse /= size[:, None]
-    inverse /= size
-    return np.asarray(inverse)
+    inverse, _ = lapack.dpotri(factor, lower=1)
+    return np.asarray((inverse + np.tril(inverse, -1).T) / size[:, None] / size)
 
 
 # ------------------------------------------------------------------------------------------
@@ -582,95 +571,7 @@ def _backward(root: FloatArray, right: FloatArray) -> FloatArray:
     return out
 
 
-# ------------------------------------------------------------------------------------------
-# Segments of a long chain of poses, each eliminated by a banded Cholesky decomposition
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ChainSegment:
-    """Neighbouring poses, eliminated together: they depend on what they see and on their ends.
-
-    Attributes:
-        rows: (6k,) of the system's poses.
-        columns: (c,) of what is kept that they depend on.
-        gain: (6k, c) how their mean follows those, negated.
-        factor, size: of their information, scaled: Cholesky's band (12, 6k) and the scale (6k,).
-    """
-
-    rows: IntArray
-    columns: IntArray
-    gain: FloatArray
-    factor: FloatArray
-    size: FloatArray
-
-    @staticmethod
-    def of(
-        rows: IntArray, chain: csr_matrix, coupling: csr_matrix
-    ) -> tuple[ChainSegment, FloatArray]:
-        """Of rows of the poses' block, and their coupling with all that is kept.
-
-        Returns:
-            The segment, and the information (c, c) that it takes from its columns.
-
-        Raises:
-            EstimatorError: the poses are not determined.
-        """
-        band, size = _scaled_band(chain)
-        try:
-            factor = cholesky_banded(band, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            raise EstimatorError(UNDETERMINED) from None
-        columns = np.unique(coupling.indices).astype(np.int64)
-        scaled = coupling[:, columns].toarray() / size[:, None]
-        gain = cho_solve_banded((factor, True), scaled, check_finite=False)
-        return ChainSegment(rows, columns, gain / size[:, None], factor, size), scaled.T @ gain
-
-    def own(self) -> FloatArray:
-        """(k, 6, 6) their covariances if what they depend on is held."""
-        size = self.size.reshape(-1, 6)
-        return _inverse_blocks(self.factor) / (size[:, :, None] * size[:, None, :])
-
-    def alone(self, gradients: FloatArray) -> FloatArray:
-        """(6k, c) their steps for gradients (6k, c) if what they depend on is held."""
-        scaled = gradients / self.size[:, None]
-        found = cho_solve_banded((self.factor, True), scaled, check_finite=False)
-        return np.asarray(-found / self.size[:, None])
-
-
-def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
-    """Lower band (12, 6n) of a chain's information, scaled to a unit diagonal, and the scale."""
-    entries = matrix.tocoo()
-    distance = entries.row - entries.col
-    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    if not (size > 0.0).all():
-        raise EstimatorError(UNDETERMINED)
-    band = np.zeros((12, len(size)))
-    lower = distance >= 0
-    row, column = entries.row[lower], entries.col[lower]
-    band[distance[lower], column] = entries.data[lower] / (size[row] * size[column])
-    return band, size
-
-
-def _inverse_blocks(factor: FloatArray) -> FloatArray:
-    """(n, 6, 6) diagonal blocks of the inverse of a matrix with banded Cholesky factor (12, 6n)."""
-    n = factor.shape[1] // 6
-    row, column = np.tril_indices(6)
-    below, across = np.indices((6, 6)).reshape(2, -1)
-    starts = 6 * np.arange(n)[:, None]
-    own, next_to = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
-    own[:, row, column] = factor[row - column, starts + column]
-    next_to[:, below, across] = factor[6 + below - across, starts + across]
-    inverse = np.linalg.inv(own)
-    carried = next_to @ inverse
-    out = np.swapaxes(inverse, 1, 2) @ inverse
-    for k in range(n - 2, -1, -1):
-        out[k] += carried[k].T @ out[k + 1] @ carried[k]
-    return out
-
-
-_POSES_A_LANDMARK = 4
-"""How many times more numbers landmarks have than the poses that cut a long chain: cuts make each
-segment see little, and the system that is left larger."""
+_SEGMENT = 8  # poses of a drive that are eliminated at once, before landmarks
 _PAIRS_AT_ONCE = 1 << 16
 """Of poses that see one landmark: a bound for memory."""
 
@@ -705,11 +606,16 @@ class LinearSystem:
         return 3 * len(self.landmark_keys)
 
     @property
-    def information(self) -> csr_matrix:
-        """All of it, landmarks before poses."""
-        own = block_diagonal(self.landmarks) + self.links
-        coupling = self.coupling.tocsr()
-        return block_array([[own, coupling.T], [coupling, self.poses]], format="csr")
+    def in_pairs(self) -> bsr_matrix:
+        """All of the information, in blocks of 6 x 6: landmarks two by two, before poses."""
+        own, links, coupling = self.landmarks, self.links.copy(), self.coupling.tocsr(copy=True)
+        if len(own) % 2:  # one more, on which nothing depends
+            own = np.concatenate([own, np.eye(3)[None]])
+            links.resize(3 * len(own), 3 * len(own))
+            coupling.resize(coupling.shape[0], 3 * len(own))
+        among = block_diagonal(own) + links
+        whole = block_array([[among, coupling.T], [coupling, self.poses]], format="csr")
+        return whole.tobsr((6, 6))
 
     def damped(self, by: float) -> LinearSystem:
         """With so many times the diagonal added to itself; unseen landmarks are held."""
@@ -728,19 +634,17 @@ class LinearSystem:
 
 
 def reduced(system: LinearSystem) -> SolvedSystem:
-    """The system with one group of variables eliminated, whichever leaves less to do.
+    """The system with landmarks or poses eliminated first, whichever leaves less to do.
 
     Raises:
         EstimatorError: the measurements do not determine all variables.
     """
     band = 12 * order(_seen_together(system))[1]
-    chain = system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns
-    return with_border(ChainMarginals.of(system) if chain else GraphMarginals.of(system))
+    poses_first = system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns
+    return with_border(GraphMarginals.of(system, landmarks_first=not poses_first))
 
 
-def with_border(
-    held: GraphMarginals | ChainMarginals,
-) -> SolvedSystem:
+def with_border(held: GraphMarginals) -> SolvedSystem:
     """The system with its border, where it has one.
 
     Raises:
@@ -752,25 +656,33 @@ def with_border(
 
 @dataclass(frozen=True, eq=False)
 class GraphMarginals:
-    """A linearised graph without its landmarks: its solution, and covariances.
+    """A linearised graph: its solution, and covariances.
+
+    Landmarks are eliminated first, each by itself, or poses are: where these are many and landmarks
+    few, since a pose depends on what is seen from there and on its neighbours.
 
     Attributes:
         system: the graph.
-        inverse: (m, 3, 3) of each landmark's own block.
-        factor: of the poses' information (6n, 6n), reduced.
+        inverse: (m, 3, 3) of each landmark's own block; None where poses are eliminated first.
+        factor: of the poses' information (6n, 6n), reduced; or of all of it, in pairs.
     """
 
     system: LinearSystem
-    inverse: FloatArray
+    inverse: FloatArray | None
     factor: BlockCholesky
 
     @staticmethod
-    def of(system: LinearSystem) -> GraphMarginals:
-        """Eliminates the landmarks.
+    def of(system: LinearSystem, landmarks_first: bool = True) -> GraphMarginals:
+        """Eliminates all variables.
 
         Raises:
             EstimatorError: a landmark is not determined by its observations, or the poses are not.
         """
+        if not landmarks_first:
+            n, pairs = len(system.pose_keys), (len(system.landmark_keys) + 1) // 2
+            kept = np.union1d(_led_back_to(system.poses), np.arange(_SEGMENT, n, _SEGMENT + 1))
+            first = pairs + np.setdiff1d(np.arange(n), kept)
+            return GraphMarginals(system, None, BlockCholesky(system.in_pairs, first))
         if system.links.nnz:
             raise EstimatorError("landmarks depend on each other directly; no joint elimination")
         inverse = _own_inverses(system)
@@ -785,7 +697,13 @@ class GraphMarginals:
         Raises:
             EstimatorError: a landmark is not determined by its observations.
         """
-        return GraphMarginals(system, _own_inverses(system), self.factor)
+        inverse = None if self.inverse is None else _own_inverses(system)
+        return GraphMarginals(system, inverse, self.factor)
+
+    @property
+    def _before(self) -> int:
+        """How many blocks of the factor are no poses."""
+        return 0 if self.inverse is not None else (len(self.system.landmark_keys) + 1) // 2
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
@@ -794,6 +712,10 @@ class GraphMarginals:
     def solve(self, gradients: FloatArray) -> FloatArray:
         """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
         s, m, c = self.system, self.system.columns, gradients.shape[1]
+        if self.inverse is None:
+            none = np.zeros((m % 2 * 3, c))  # of the landmark that makes the last pair
+            found = self.factor.solve(np.concatenate([gradients[:m], none, gradients[m:]]))
+            return -np.concatenate([found[:m], found[m + len(none) :]])
         own = "mij,mjc->mic", self.inverse
         pull = np.einsum(*own, gradients[:m].reshape(-1, 3, c)).reshape(m, c)
         poses = -self.factor.solve(gradients[m:] - s.coupling @ pull)
@@ -803,15 +725,23 @@ class GraphMarginals:
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        every = np.arange(len(self.system.pose_keys))
+        every = self._before + np.arange(len(self.system.pose_keys))
         return self.factor.inverse_blocks(every, every)
 
     def pose_columns(self, rows: IntArray) -> FloatArray:
         """(6n, 6k) covariances of all poses and some, by row of ``pose_keys``."""
-        return self.factor.solve(_unit_columns(rows, 6 * len(self.system.pose_keys)))
+        first = 6 * self._before
+        unit = np.zeros((first + 6 * len(self.system.pose_keys), 6 * len(rows)))
+        unit[first + _entries_of(rows), np.arange(6 * len(rows))] = 1.0
+        return self.factor.solve(unit)[first:]
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        if self.inverse is None:
+            every = np.arange(self._before)
+            pairs = self.factor.inverse_blocks(every, every)
+            own = np.stack([pairs[:, :3, :3], pairs[:, 3:, 3:]], axis=1).reshape(-1, 3, 3)
+            return own[: len(self.system.landmark_keys)]
         coupling = _times(self.system.coupling, self.inverse)
         pose = np.repeat(np.arange(len(self.system.pose_keys)), np.diff(coupling.indptr))
         order = np.argsort(coupling.indices, kind="stable")
@@ -866,116 +796,9 @@ def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
         low = high
 
 
-@dataclass(frozen=True, eq=False)
-class ChainMarginals:
-    """The same where poses are many and landmarks few: the poses are eliminated first.
-
-    Poses are tied to their neighbours by odometry, so their block is a band, and its Cholesky
-    decomposition and the diagonal blocks of its inverse cost a constant a pose. The few poses to
-    which a loop leads back are kept with the landmarks instead: without them the rest is a chain.
-    Some more are kept that cut it into segments, each of which depends on the landmarks seen from
-    there and on no others.
-
-    Attributes:
-        system: the graph.
-        segments: poses that are eliminated.
-        kept: (3m + 6k,) rows in the system's information of all landmarks and the k poses kept.
-        border: their information.
-    """
-
-    system: LinearSystem
-    segments: list[ChainSegment]
-    kept: IntArray
-    border: DenseFactor
-
-    @staticmethod
-    def of(system: LinearSystem) -> ChainMarginals:
-        """Eliminates the poses.
-
-        Raises:
-            EstimatorError: the poses are not determined.
-        """
-        columns, information, n = system.columns, system.information, len(system.pose_keys)
-        among = information[columns:, columns:]
-        cuts = np.arange(n)[:: _POSES_A_LANDMARK * 6 * n // max(columns, 1) + 2][1:]
-        apart = np.union1d(_led_back_to(among), cuts)
-        rows = np.arange(6 * n).reshape(-1, 6)
-        kept = np.concatenate([np.arange(columns), columns + rows[apart].ravel()])
-        coupling = information[columns:][:, kept]
-        border = information[kept][:, kept].toarray()
-        left = np.delete(np.arange(n), apart)
-        segments = []
-        for chosen in np.split(left, np.flatnonzero(np.diff(left) > 1) + 1):
-            if not len(chosen):
-                continue
-            own = rows[chosen].ravel()
-            segment, taken = ChainSegment.of(own, among[own][:, own], coupling[own])
-            border[np.ix_(segment.columns, segment.columns)] -= taken
-            segments.append(segment)
-        return ChainMarginals(system, segments, kept, DenseFactor(border))
-
-    def stepping(self, system: LinearSystem) -> ChainMarginals:
-        """Another system much like it, by the factors of this one: for steps alone."""
-        return replace(self, system=system)
-
-    def step(self) -> FloatArray:
-        """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
-        return self.solve(self.system.gradient[:, None])[:, 0]
-
-    def solve(self, gradients: FloatArray) -> FloatArray:
-        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
-        of_poses, pull = gradients[self.system.columns :], gradients[self.kept]
-        for segment in self.segments:
-            pull[segment.columns] -= segment.gain.T @ of_poses[segment.rows]
-        moved = -self.border.solve(pull)
-        out = np.empty_like(gradients)
-        out[self.kept] = moved
-        for segment in self.segments:
-            alone = segment.alone(of_poses[segment.rows])
-            out[self.system.columns + segment.rows] = alone - segment.gain @ moved[segment.columns]
-        return out
-
-    def poses(self) -> FloatArray:
-        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        columns, covariance = self.system.columns, self.border.inverse
-        out = np.empty((len(self.system.pose_keys), 6, 6))
-        out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
-        for segment in self.segments:
-            own = segment.own()
-            gain = segment.gain.reshape(len(own), 6, -1)
-            among = covariance[np.ix_(segment.columns, segment.columns)]
-            out[segment.rows[::6] // 6] = own + gain @ among @ np.swapaxes(gain, 1, 2)
-        return out
-
-    def pose_columns(self, rows: IntArray) -> FloatArray:
-        """(6n, 6k) covariances of all poses and some, by row of ``pose_keys``."""
-        columns, n = self.system.columns, 6 * len(self.system.pose_keys)
-        unit = np.concatenate([np.zeros((columns, 6 * len(rows))), _unit_columns(rows, n)])
-        return -self.solve(unit)[columns:]
-
-    def landmarks(self) -> FloatArray:
-        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
-        columns = self.system.columns
-        return _diagonal(self.border.inverse[:columns, :columns], 3)
-
-
 def _entries_of(rows: IntArray) -> IntArray:
     """(6k,) entries of poses (k,)."""
     return np.asarray((6 * rows[:, None] + np.arange(6)).ravel())
-
-
-def _unit_columns(rows: IntArray, size: int) -> FloatArray:
-    """(size, 6k) columns of the identity, of poses (k,)."""
-    out = np.zeros((size, 6 * len(rows)))
-    out[_entries_of(rows), np.arange(6 * len(rows))] = 1.0
-    return out
-
-
-def _diagonal(matrix: FloatArray, size: int) -> FloatArray:
-    """(k, size, size) blocks on the diagonal of a matrix (k size, k size)."""
-    k = len(matrix) // size
-    every = np.arange(k)
-    return np.asarray(matrix.reshape(k, size, k, size)[every, :, every, :])
 
 
 def _led_back_to(matrix: csr_matrix) -> IntArray:
@@ -993,5 +816,5 @@ def block_diagonal(blocks: FloatArray) -> csr_matrix:
     return bsr_matrix((blocks, np.arange(m), np.arange(m + 1)), (size * m, size * m)).tocsr()
 
 
-SolvedSystem: TypeAlias = GraphMarginals | ChainMarginals | Bordered
+SolvedSystem: TypeAlias = GraphMarginals | Bordered
 """A solved system, landmarks (3m) before poses (6n), then a border where it has one."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -19,9 +18,8 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.bundle import PLAIN
 from fgslam.backend.smoothers.elimination import (
     BlockCholesky,
-    ChainMarginals,
-    DenseFactor,
     GraphMarginals,
+    SolvedSystem,
     UndeterminedError,
     from_cholesky,
     groups_of,
@@ -106,63 +104,17 @@ def test_what_is_not_positive_definite_is_refused(rng: np.random.Generator) -> N
 
 
 # ------------------------------------------------------------------------------------------
-# A dense matrix that is factored, and inverted, in its own place
-
-
-def positive(rng: np.random.Generator, size: int) -> FloatArray:
-    """Of rows and columns a thousand times as large as others."""
-    root = rng.standard_normal((size, size)) + 3.0 * np.eye(size)
-    scale = np.where(np.arange(size) % 2, 1e3, 1.0)
-    return np.asarray((root @ root.T + size * np.eye(size)) * scale * scale[:, None])
-
-
-def test_inverse_and_solutions_before_and_after_it(rng: np.random.Generator) -> None:
-    matrix, right = positive(rng, 40), rng.standard_normal(40)
-    expected = np.linalg.inv(matrix)
-    deviation = np.sqrt(np.diagonal(expected))
-    factor = DenseFactor(matrix.copy())
-    for _ in range(2):
-        off = (factor.solve(right) - expected @ right) / deviation
-        np.testing.assert_allclose(off, 0.0, atol=1e-9, rtol=0.0)
-        off = (factor.inverse - expected) / (deviation * deviation[:, None])
-        np.testing.assert_allclose(off, 0.0, atol=1e-9, rtol=0.0)
-
-
-def test_there_is_never_a_second_matrix(rng: np.random.Generator) -> None:
-    matrix = positive(rng, 800)
-    tracemalloc.start()
-    try:
-        factor = DenseFactor(matrix)
-        factor.solve(np.ones(800))
-        assert np.isfinite(factor.inverse).all()
-        assert tracemalloc.get_traced_memory()[1] < 0.3 * matrix.nbytes
-    finally:
-        tracemalloc.stop()
-
-
-def test_row_of_what_is_not_determined_is_named(rng: np.random.Generator) -> None:
-    matrix = positive(rng, 6)
-    matrix[4] = matrix[:, 4] = 0.0
-    with pytest.raises(UndeterminedError) as caught:
-        DenseFactor(matrix)
-    assert caught.value.row == 4
-
-
-# ------------------------------------------------------------------------------------------
 # Marginals of whole graphs, both orders of elimination and the dense one, against GTSAM's own
 
 
-Whole = type[GraphMarginals] | type[ChainMarginals]
-BOTH: list[Whole] = [GraphMarginals, ChainMarginals]
+BOTH = [True, False]  # whether landmarks are eliminated first
 PITCHED = g.so3_exp(np.array([0.3, 0.0, 0.1])) @ np.array([0.0, 1.0, 0.0])
 RELATIVE = 1e-8
 
 
-def whole(
-    kind: Whole, graph: Any, values: Any, kernel: KernelSettings = PLAIN
-) -> GraphMarginals | ChainMarginals:
+def whole(first: bool, graph: Any, values: Any, kernel: KernelSettings = PLAIN) -> GraphMarginals:
     system, state = in_arrays(graph, values, kernel)
-    return kind.of(system.linear(state))
+    return GraphMarginals.of(system.linear(state), first)
 
 
 class Problem:
@@ -215,7 +167,7 @@ class Problem:
         return gtsam.Marginals(self.graph, self.values)
 
 
-def either(graph: Any, values: Any) -> GraphMarginals | ChainMarginals:
+def either(graph: Any, values: Any) -> SolvedSystem:
     system, state = in_arrays(graph, values)
     return reduced(system.linear(state))
 
@@ -242,9 +194,9 @@ def problems() -> dict[str, Callable[[np.random.Generator], Problem]]:
     }
 
 
-@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("first", BOTH)
 @pytest.mark.parametrize("name", problems())
-def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Generator) -> None:
+def test_marginals_of_all_variables(name: str, first: bool, rng: np.random.Generator) -> None:
     problem = problems()[name](rng)
     reference = problem.reference()
     kernel = KernelSettings("cauchy", 0.5) if name == "robust" else PLAIN
@@ -252,7 +204,7 @@ def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Gener
     system = graph.linear(state)
     assert system.pose_keys.tolist() == problem.poses
     assert system.landmark_keys.tolist() == problem.landmarks
-    found = kind.of(system)
+    found = GraphMarginals.of(system, first)
     poses, landmarks = found.poses(), found.landmarks()
     assert poses.shape == (len(problem.poses), 6, 6)
     assert landmarks.shape == (len(problem.landmarks), 3, 3)
@@ -263,17 +215,19 @@ def test_marginals_of_all_variables(name: str, kind: Whole, rng: np.random.Gener
 
 
 def test_the_larger_group_is_eliminated_first(rng: np.random.Generator) -> None:
-    for poses, landmarks, kind in ((3, 12, GraphMarginals), (15, 3, ChainMarginals)):
+    for poses, landmarks, landmarks_first in ((3, 12, True), (15, 3, False)):
         problem = Problem(rng, poses, landmarks)
-        assert isinstance(either(problem.graph, problem.values), kind)
+        found = either(problem.graph, problem.values)
+        assert isinstance(found, GraphMarginals)
+        assert (found.inverse is not None) is landmarks_first
 
 
 # --------------------------------------------------------------------------------------------
 # Refused
 
 
-@pytest.mark.parametrize("kind", BOTH)
-def test_a_graph_without_a_prior_is_refused(kind: Whole, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("first", BOTH)
+def test_a_graph_without_a_prior_is_refused(first: bool, rng: np.random.Generator) -> None:
     problem = Problem(rng)
     problem.graph.remove(0)
     loose = gtsam.NonlinearFactorGraph()
@@ -281,12 +235,12 @@ def test_a_graph_without_a_prior_is_refused(kind: Whole, rng: np.random.Generato
         if problem.graph.exists(row):
             loose.add(problem.graph.at(row))
     with pytest.raises(EstimatorError, match="determine"):
-        whole(kind, loose, problem.values).poses()
+        whole(first, loose, problem.values).poses()
 
 
-@pytest.mark.parametrize("kind", BOTH)
+@pytest.mark.parametrize("first", BOTH)
 def test_a_landmark_seen_once_by_one_camera_is_refused(
-    kind: Whole, rng: np.random.Generator
+    first: bool, rng: np.random.Generator
 ) -> None:
     """Two numbers for three unknowns: its distance is open."""
     problem = Problem(rng)
@@ -298,7 +252,7 @@ def test_a_landmark_seen_once_by_one_camera_is_refused(
     )
     problem.graph.add(top)
     with pytest.raises(EstimatorError, match="determine"):
-        whole(kind, problem.graph, problem.values).poses()
+        whole(first, problem.graph, problem.values).poses()
 
 
 def test_landmarks_that_depend_on_each_other_are_refused(rng: np.random.Generator) -> None:
@@ -312,9 +266,9 @@ def test_landmarks_that_depend_on_each_other_are_refused(rng: np.random.Generato
     )
     problem.graph.add(between)
     with pytest.raises(EstimatorError, match="depend on each other"):
-        whole(GraphMarginals, problem.graph, problem.values)
+        whole(True, problem.graph, problem.values)
     reference = problem.reference()
-    chain = whole(ChainMarginals, problem.graph, problem.values).landmarks()
+    chain = whole(False, problem.graph, problem.values).landmarks()
     for n, key in enumerate(problem.landmarks):
         assert_same(chain[n], reference.marginalCovariance(key))
 
@@ -327,12 +281,21 @@ def test_poses_that_close_loops(rng: np.random.Generator, ends: list[tuple[int, 
         loop = Odometry(g.se3_exp(0.02 * rng.standard_normal(6)), random_covariance(rng, 6, 0.05))
         problem.graph.add(odometry_factor(problem.poses[before], problem.poses[after], loop))
     reference = problem.reference()
-    for kind in BOTH:
-        found = whole(kind, problem.graph, problem.values)
+    for first in BOTH:
+        found = whole(first, problem.graph, problem.values)
         for k, key in enumerate(problem.poses):
             assert_same(found.poses()[k], reference.marginalCovariance(key))
         for n, key in enumerate(problem.landmarks):
             assert_same(found.landmarks()[n], reference.marginalCovariance(key))
+
+
+def test_row_of_what_is_not_determined_is_named(rng: np.random.Generator) -> None:
+    root = rng.standard_normal((6, 6))
+    matrix = root @ root.T + np.eye(6)
+    matrix[4] = matrix[:, 4] = 0.0
+    with pytest.raises(UndeterminedError) as caught:
+        scaled_cholesky(matrix)
+    assert caught.value.row == 4
 
 
 def test_nothing_is_inverted_without_a_word_on_the_terminal(
