@@ -27,7 +27,8 @@ from fgslam.backend.settings import DEFAULT_ESTIMATOR
 from fgslam.core.arrays import Image
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.types import Trajectory
-from fgslam.datasets.folders import TRUTH_LEFT, write_image_folder, write_poses
+from fgslam.datasets.folders import write_image_folder, write_poses
+from fgslam.datasets.recording import TRUTH_LEFT
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 RECORDINGS = (

@@ -26,7 +26,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.core.files import shown_in
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
-from fgslam.core.sensors import PoseFrame, body_is_camera
+from fgslam.core.sensors import CAMERA_NAMES, body_is_camera
 from fgslam.core.sides import differ_in_number
 from fgslam.datasets import bag_messages as messages
 from fgslam.datasets.bag_messages import FrameTree, view_axes
@@ -42,27 +42,23 @@ from fgslam.datasets.depth import (
     DEPTH_SIGMA_M,
     MILLIMETRES,
     camera_of_file,
-    colour_and_depth_notes,
     depth_images,
     depth_rig,
     depth_sigma_px,
     depth_unit,
-    entry_of_depth,
     require_one_camera,
     sample_depths,
 )
 from fgslam.datasets.images import (
     Depth,
-    DepthLoader,
     bits_held,
     both_views,
     images_of_cameras,
     mosaic_note,
     require_size,
-    shown_together,
 )
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
-from fgslam.datasets.ledger import Entry, entry_of_pairs
+from fgslam.datasets.ledger import IMAGES, TIMES, Entry
 from fgslam.datasets.odometry import (
     POSE_COLUMNS,
     RATE_COLUMNS,
@@ -72,14 +68,15 @@ from fgslam.datasets.odometry import (
     recorded_motions,
 )
 from fgslam.datasets.recording import (
-    LOOKS_AHEAD,
     Recording,
     image_recording,
     in_order,
     loaded_rig,
+    looks_ahead,
     mounted,
     numbered,
     read_rig,
+    rig_of_views,
 )
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.datasets.times import NANOSECONDS, Table, pair_stamps
@@ -108,15 +105,14 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     placed = _rig_of_views(settings, bag, chosen)
     rig, chosen = placed.rig, placed.chosen
     views = (chosen.right, chosen.left, *chosen.views[2:])
-    others = [
-        (side, view, bag.stamps[view])
-        for side, view in zip(("left", "top"), views[1:], strict=False)
-    ]
-    rows, unpaired = pair_stamps(bag.stamps[chosen.right], others, chosen.right)
+    right_side, *sides = ("colour", "depth") if chosen.depth else CAMERA_NAMES
+    others = [(s, view, bag.stamps[view]) for s, view in zip(sides, views[1:], strict=False)]
+    stamps = bag.stamps[chosen.right]
+    rows, unpaired, pairing = pair_stamps(stamps, others, chosen.right, right_side)
     places = np.column_stack([bag.places[v][rows[:, k]] for k, v in enumerate(views)])
-    right, size, sigma = places[:, 0].tolist(), rig.image_size, None
-    load_depth: DepthLoader | None = None
-    unit: tuple[Entry, ...] = ()
+    right, size = places[:, 0].tolist(), rig.image_size
+    more: dict[str, Any] = {"truth_frame": "left"}
+    ledger = [placed.mounting] if placed.mounting else []
     bits, held = bits_held(len(right), lambda k: bag.read(right[k], messages.stored_of))
     bag.bits = bits
     held += mosaic_note(len(right), lambda k: bag.image(right[k]))
@@ -137,12 +133,12 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         stated = settings.depth_scale or bag.depth_scale(chosen.unit)
         if stated is None and of_integers and not SENSOR.match(chosen.left):
             stated = MILLIMETRES  # REP 118
-        scale, reported = depth_unit(where, seen, of_integers, stated)
+        scale, reported, unit = depth_unit(where, seen, of_integers, stated)
         placed = replace(placed, notes=(*placed.notes, *reported))
-        unit = (entry_of_depth(scale, reported, stated is not None or not of_integers),)
-        load, load_depth = depth_images(read, rig, placed.cameras[1])
-        sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
-        unpaired = colour_and_depth_notes(unpaired)
+        ledger.append(unit)
+        load, more["load_depth"] = depth_images(read, rig, placed.cameras[1])
+        more["disparity_sigma_px"] = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
+        more["truth_frame"] = "right"  # the colour camera's
     else:
 
         def load(index: int, colour: bool) -> tuple[Image, ...]:
@@ -154,23 +150,20 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
                 lambda place: image(place, colour), places[index].tolist(), rig
             )
 
-    recording = image_recording(
+    shown = f"{chosen.left} is {'depth' if chosen.depth else 'left'}, {chosen.right} right"
+    how = "--topics" if settings.topics else "types and names of topics"
+    topics = Entry(IMAGES, shown, how, "--topics", not settings.topics)
+    return image_recording(
         settings,
         where.resolve().stem,
         replace(rig, remarks=()),
-        NANOSECONDS * bag.stamps[chosen.right][rows[:, 0]].astype(np.float64),
+        NANOSECONDS * stamps[rows[:, 0]].astype(np.float64),
         load,
         ([], [file for path in bag.paths for file in _bag_files(path)]),
         (*bag.notes, *chosen.notes, *bag.stamp_notes, *unpaired, *held, *placed.notes),
-        _odometry_source(chosen.motion, *bag.motions, odometry),
-    )
-    frame: PoseFrame = "right" if chosen.depth else "left"  # the colour camera's
-    shown = f"{chosen.left} is {'depth' if chosen.depth else 'left'}, {chosen.right} right"
-    how = "--topics" if settings.topics else "types and names of topics"
-    topics = Entry("images", shown, how, "--topics", not settings.topics)
-    ledger = (*recording.ledger, topics, entry_of_pairs(unpaired), *unit)
-    return replace(
-        recording, disparity_sigma_px=sigma, truth_frame=frame, ledger=ledger, load_depth=load_depth
+        (topics, pairing, Entry(TIMES, "stamps", "headers of the messages"), *ledger),
+        odometry_source=_odometry_source(chosen.motion, *bag.motions, odometry),
+        **more,
     )
 
 
@@ -486,6 +479,7 @@ class Placed:
     """A rig, its cameras left and right, the topics with sides as calibrated, what was noticed.
 
     ``on_body``: the file's body is another thing than a camera, as an IMU, whatever its axes.
+    ``mounting``: what is guessed of its place on the body whose odometry is used.
     """
 
     rig: StereoRig
@@ -493,6 +487,7 @@ class Placed:
     chosen: Chosen
     notes: tuple[str, ...] = ()
     on_body: bool = False
+    mounting: Entry | None = None
 
 
 def _rig_of_views(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
@@ -501,19 +496,16 @@ def _rig_of_views(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     Raises:
         CalibrationError: as there, or the calibration is of no part of the images.
     """
-    whole, fault = bag.size, None
     if chosen.depth or chosen.left != chosen.right:
         return rig_of_bag(settings, bag, chosen)
-    for name, columns, rows in shown_together(whole):
-        bag.size = (whole[0] // columns, whole[1] // rows)
-        try:
-            placed = rig_of_bag(settings, bag, chosen)
-        except CalibrationError as error:
-            fault = fault or error
-            continue
-        note = f"each image of {chosen.right} is taken as both views, {name}"
-        return replace(placed, notes=(note, *placed.notes))
-    raise fault or CalibrationError(f"{settings.path}: no views")
+
+    def of_size(size: tuple[int, int], _: object) -> Placed:
+        bag.size = size
+        return rig_of_bag(settings, bag, chosen)
+
+    placed, name = rig_of_views(bag.size, of_size)
+    note = f"each image of {chosen.right} is taken as both views, {name}"
+    return replace(placed, notes=(note, *placed.notes))
 
 
 def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
@@ -537,7 +529,8 @@ def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
         rig, notes = mounted(placed.rig, settings), placed.rig.remarks
     else:
-        rig, reported = _on_robot(placed, bag)
+        rig, reported, mounting = _on_robot(placed, bag)
+        placed = replace(placed, mounting=mounting)
         notes = (*placed.rig.remarks, *reported)
     return replace(placed, rig=rig, notes=(*placed.notes, *notes))
 
@@ -719,14 +712,14 @@ _BODIES = ("base_link", "base_footprint")
 """The robot itself, where odometry does not name its frame (REP 105)."""
 
 
-def _on_robot(placed: Placed, bag: Bag) -> tuple[StereoRig, tuple[str, ...]]:
-    """The rig in the frame whose motion the odometry is, and how that was known.
+def _on_robot(placed: Placed, bag: Bag) -> tuple[StereoRig, tuple[str, ...], Entry | None]:
+    """The rig in the frame whose motion the odometry is, how that was known, and what is guessed.
 
     Where no transform leads to the camera: as calibrated, else by its frame's axes.
     """
     rig, chosen, tree = placed.rig, placed.chosen, bag.tree
     if chosen.motion is None:
-        return rig, ()
+        return rig, (), None
     left, right = (bag.frames[topic] for topic in (chosen.left, chosen.right))
     robot = next((body for body in _BODIES if body in tree.frames), "")
     body = bag.frames[chosen.motion.name] or robot
@@ -737,13 +730,12 @@ def _on_robot(placed: Placed, bag: Bag) -> tuple[StereoRig, tuple[str, ...]]:
     except CalibrationError as fault:
         reason = f" ({fault})" if tree.frames else ""
         if placed.on_body or not body_is_camera(rig.bTc):
-            return rig, ()
+            return rig, (), None
         if "optical" in body:  # axes of a camera (REP 103), as RealSense's gyroscope has
             text = f"{body} has a camera's axes, and is taken as turned like the camera{reason}"
-            return rig, (text,)
-        unknown = "nothing states where the camera sits on the robot whose odometry is used"
-        ahead = replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
-        return ahead, (f"{unknown}{reason}: {LOOKS_AHEAD}",)
+            return rig, (text,), None
+        guess = looks_ahead(f"the robot whose odometry is used{reason}")
+        return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (guess.source,), guess
     fTc, reported = view_axes(tree, left, right, body)
     bTc = bTf @ fTc @ inverse(placed.cameras[camera].bTc) @ rig.bTc
     x, y, z = (round(float(v), 3) + 0.0 for v in bTc[:3, 3])
@@ -751,4 +743,4 @@ def _on_robot(placed: Placed, bag: Bag) -> tuple[StereoRig, tuple[str, ...]]:
         f"by tf_static the right camera is {x:g}, {y:g}, {z:g} m (x, y, z) from {body}, whose "
         f"motion {chosen.motion.name} is"
     )
-    return replace(rig, bTc=bTc), (note, *filter(None, [reported]))
+    return replace(rig, bTc=bTc), (note, *filter(None, [reported])), None

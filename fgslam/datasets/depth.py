@@ -42,13 +42,11 @@ from fgslam.datasets.layouts import (
     counts_by_one,
     images_in,
 )
-from fgslam.datasets.ledger import Entry, entry_of_pairs, entry_of_times
+from fgslam.datasets.ledger import DEPTH, LENS, PAIRING, TIMES, Entry
 from fgslam.datasets.recording import (
     Recording,
-    image_recording,
+    folder_recording,
     mounted,
-    on_wheels,
-    with_truth,
 )
 from fgslam.datasets.settings import (
     CalibratedSettings,
@@ -57,11 +55,12 @@ from fgslam.datasets.settings import (
     RgbdSettings,
 )
 from fgslam.datasets.times import (
-    ASSUMED_FPS,
     NANOSECONDS,
+    Pairs,
+    Stamps,
+    even_stamps,
     pair_files,
     pair_stamps,
-    read_tum,
     stamps_of,
 )
 
@@ -185,20 +184,19 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         CalibrationError: nothing states the colour camera's focal length.
     """
     root = Path(settings.path)
-    pairs, stamps, notes, lists = _pairs(root, settings.fps)
+    (pairs, unpaired, pairing), (stamps, assumed, lists, timing) = _pairs(root, settings.fps)
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
     rig = mounted(depth_rig(camera), settings)
-    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
     seen, of_integers = sample_depths(
         root, len(pairs), lambda k: read_depth_image(pairs[k][1]), size
     )
     stated = settings.depth_scale or _stated_scale(root, settings)
     of_tum = (root / "depth.txt").is_file()
-    scale, reported = depth_unit(root, seen, of_integers, stated, of_tum)
+    scale, reported, unit = depth_unit(root, seen, of_integers, stated, of_tum)
 
     def read(index: int) -> tuple[Image, Depth, str]:
         colour_file, depth_file = pairs[index]
@@ -207,25 +205,16 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         return colour, depth.astype(np.float32) / np.float32(scale), str(depth_file)
 
     images, depth = depth_images(read, rig, camera)
-    files = [*lists, *wheels], (path for pair in pairs for path in pair)
-    notes = (*notes, *known, *reported, *mounting)
-    name, truth = root.resolve().name, root / "groundtruth.txt"
-    recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
-    sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
+    files = lists, (path for pair in pairs for path in pair)
+    notes = (*unpaired, *assumed, *known, *reported)
     lens = camera.model if camera.distortion.any() else "none"
-    ledger = (
-        *recording.ledger,
-        Entry("lens model", lens, settings.camera_file or str(root), "--camera"),
-        entry_of_depth(scale, reported, stated is not None),
-        entry_of_times(lists, notes, settings.fps),
-        entry_of_pairs(notes),
-    )
-    recording = replace(
-        recording, disparity_sigma_px=sigma, truth_frame="right", ledger=ledger, load_depth=depth
-    )
-    if not truth.is_file():
-        return recording
-    return with_truth(recording, read_tum(truth), truth, stamps)
+    lens_entry = Entry(LENS, lens, settings.camera_file or str(root), "--camera")
+    sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
+    return folder_recording(
+        settings, odometry, root, rig, stamps, images, files, notes,
+        ledger=(lens_entry, unit, timing, pairing), disparity_sigma_px=sigma,
+        truth_frame="right", load_depth=depth,
+    )  # fmt: skip
 
 
 def require_one_camera(settings: CalibratedSettings) -> None:
@@ -235,33 +224,21 @@ def require_one_camera(settings: CalibratedSettings) -> None:
             raise DatasetError(f"{settings.path}: dataset.{name} is for two cameras; leave it out")
 
 
-def colour_and_depth_notes(notes: tuple[str, ...]) -> tuple[str, ...]:
-    """Notes on the pairs of two cameras in the words of colour and depth."""
-    words = (
-        ("left and right images", "colour and depth"),
-        ("right images", "colour images"),
-        ("left images", "depth images"),
-    )
-    for of_cameras, of_depth in words:
-        notes = tuple(note.replace(of_cameras, of_depth) for note in notes)
-    return notes
-
-
-def _pairs(
-    root: Path, fps: float | None
-) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...], tuple[Path, ...]]:
-    """Colour and depth of each frame, their stamps (n,) in seconds, notes and lists."""
+def _pairs(root: Path, fps: float | None) -> tuple[Pairs, Stamps]:
+    """Colour and depth of each frame, and the times of the colour images."""
     lists = (root / "rgb.txt", root / "depth.txt")
     if all(path.is_file() for path in lists):
-        (colour_at, colours), (depth_at, depths) = (_listed(path) for path in lists)
-        others = [("left", str(lists[1]), depth_at)]
-        rows, notes = pair_stamps(colour_at, others, str(lists[0]))
+        (colour_at, colours), (depth_at, depths) = map(_listed, lists)
+        others = [("depth", str(lists[1]), depth_at)]
+        rows, notes, pairing = pair_stamps(colour_at, others, str(lists[0]), "colour")
         pairs = tuple((colours[i], depths[j]) for i, j in rows.tolist())
-        stamps = NANOSECONDS * colour_at[rows[:, 0]].astype(np.float64)
-        stamps = stamps if fps is None else rows[:, 0] / fps
-        return pairs, stamps, colour_and_depth_notes(notes), lists
+        timed = even_stamps(rows[:, 0], fps)
+        if fps is None:
+            entry = Entry(TIMES, "stamps", str(lists[0]), "--fps")
+            timed = Stamps(NANOSECONDS * colour_at[rows[:, 0]].astype(np.float64), (), (), entry)
+        return (pairs, notes, pairing), timed._replace(lists=lists)
     if path := next((root / n for n in _ASSOCIATIONS if (root / n).is_file()), None):
-        return *_associated(path, fps), (path,)
+        return _associated(path, fps)
     if (folders := colour_and_depth(root)) is not None:
         mixed = images_in(folders[0]), images_in(folders[1])
         if empty := [str(f) for f, images in zip(folders, mixed, strict=True) if not images]:
@@ -271,23 +248,20 @@ def _pairs(
     else:
         raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
     colour_files, depth_files = map(tuple, mixed)
-    cameras = CameraFiles(depth_files, colour_files, root, interleaved=False)
-    pairs, notes = pair_files(cameras)
-    used = [colour for colour, _ in pairs]
-    stamps, assumed, found = stamps_of(used, (used[0].parent, root), fps, colour_files)
-    return pairs, stamps, (*colour_and_depth_notes(notes), *assumed), found
+    found = CameraFiles(depth_files, colour_files, root, False, sides=("depth", "colour"))
+    paired = pair_files(found)
+    used = [colour for colour, _ in paired[0]]
+    return paired, stamps_of(used, (used[0].parent, root), fps, colour_files)
 
 
 _ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
 """Of TUM's associate.py: lines `seconds file seconds file`, colour or depth first."""
 
 
-def _associated(
-    path: Path, fps: float | None
-) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...]]:
-    """Files of colour and depth, colour's stamps (n,) in seconds, and notes.
+def _associated(path: Path, fps: float | None) -> tuple[Pairs, Stamps]:
+    """Files of colour and depth, and colour's stamps; those that count the images state no times.
 
-    Stamps that count the images, as ICL-NUIM's, state no times.
+    So ICL-NUIM's do.
     """
     rows = [(number, text.split()) for number, text in read_lines(path)]
     for number, words in rows:
@@ -299,19 +273,17 @@ def _associated(
     (colour_at, colour), (_, depth) = ((2, 3), (0, 1)) if depth_first else ((0, 1), (2, 3))
     pairs = tuple((path.parent / w[colour], path.parent / w[depth]) for _, w in rows)
     times = [words[colour_at] for _, words in rows]
-    counted = all(map(str.isdecimal, times)) and counts_by_one([int(t) for t in times])
-    if fps is not None or counted:
-        stamps, notes, _ = stamps_of([pair[0] for pair in pairs], (), fps or ASSUMED_FPS)
-        reason = f"{path.name} counts images and states no times: taken as {ASSUMED_FPS:g} frames"
-        return (
-            pairs,
-            stamps,
-            (*notes, *([] if fps else [f"{reason} a second (--fps states another)"])),
-        )
-    stamps = np.array([float(t) for t in times])
-    if len(stamps) == 0 or np.any(np.diff(stamps) <= 0.0):
-        raise DatasetError(f"{path}: lists no image, or times do not increase; restore the file")
-    return pairs, stamps, ()
+    if fps or (all(map(str.isdecimal, times)) and counts_by_one([int(t) for t in times])):
+        why = f"{path.name} counts images and states no times"
+        timed = even_stamps(np.arange(len(pairs)), fps, why)
+    else:
+        stamps = np.array([float(t) for t in times])
+        if len(stamps) == 0 or np.any(np.diff(stamps) <= 0.0):
+            raise DatasetError(
+                f"{path}: lists no image, or times do not increase; restore the file"
+            )
+        timed = Stamps(stamps, (), (), Entry(TIMES, "stamps", str(path), "--fps"))
+    return (pairs, (), Entry(PAIRING, "as listed", str(path))), timed._replace(lists=(path,))
 
 
 def _listed(path: Path) -> tuple[IntArray, list[Path]]:
@@ -345,8 +317,8 @@ _SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor", "png_depth_sc
 
 def depth_unit(
     where: Path, seen: FloatArray, of_integers: bool, stated: float | None, of_tum: bool = False
-) -> tuple[float, tuple[str, ...]]:
-    """Units a metre, and the depth that follows from it in words.
+) -> tuple[float, tuple[str, ...], Entry]:
+    """Units a metre, the depth that follows from it in words, and where the unit is from.
 
     Where nothing states it, TUM's or millimetres, whichever a depth camera can have seen. Motion
     does not decide it: all that is seen is the same in a world of another size. Where both or
@@ -386,14 +358,10 @@ def depth_unit(
             "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
         )
     taken = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
-    return scale, (*caveat, taken)
-
-
-def entry_of_depth(scale: float, reported: tuple[str, ...], stated: bool) -> Entry:
-    """The unit of depth for the ledger."""
-    source = "the recording, its calibration or the settings" if stated else reported[0]
-    value = f"{scale:g} units a metre"
-    return Entry("unit of depth", value, source, "dataset.depth_scale", not stated)
+    notes, guessed = (*caveat, taken), stated is None and of_integers
+    source = notes[0] if guessed else "the recording, its calibration or the settings"
+    value, option = f"{scale:g} units a metre", "dataset.depth_scale"
+    return scale, notes, Entry(DEPTH, value, source, option, guessed)
 
 
 def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:

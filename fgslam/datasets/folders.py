@@ -17,7 +17,7 @@ from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.files import make_subfolder, write_bytes, write_text
-from fgslam.core.sensors import CAMERA_NAMES, CameraRig, PoseFrame
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import (
     encoded_png,
@@ -26,17 +26,16 @@ from fgslam.datasets.images import (
     open_frames,
     require_folder,
 )
-from fgslam.datasets.layouts import files_of, find_cameras
-from fgslam.datasets.ledger import Entry, entry_of_pairs, entry_of_times
+from fgslam.datasets.layouts import files_of, find_cameras, images_in, only_images
+from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
 from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
-    image_recording,
+    folder_recording,
     loaded_rig,
     mounted,
     numbered,
-    on_wheels,
-    with_truth,
+    rig_of_views,
 )
 from fgslam.datasets.settings import (
     ImageFolderSettings,
@@ -46,7 +45,6 @@ from fgslam.datasets.settings import (
 from fgslam.datasets.times import (
     pair_files,
     read_table,
-    read_tum,
     require_increasing,
     stamps_of,
 )
@@ -54,8 +52,6 @@ from fgslam.datasets.times import (
 # ------------------------------------------------------------------------------------------
 # Our own layout: left/, right/[, top/], calib.json, times.txt
 
-TRUTH_LEFT = "gt_left_cam.txt"
-TRUTH_RIGHT = "gt_right_cam.txt"
 _LAST_NUMBER = 2.0**53  # beyond it a float is no single whole number
 
 
@@ -90,7 +86,6 @@ def open_image_folder(
         for number in numbers.tolist()
     ]
     images, noticed = open_frames(files, rig, root)
-    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
     known = set(numbers.tolist())
     unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
     notes = [
@@ -102,17 +97,17 @@ def open_image_folder(
             "calib.json states a vertical baseline but there is no top/: read as two cameras"
         )
     present = [path for path in (calibration,) if path.is_file()]
-    defining = [*present, root / "times.txt", *wheels]
-    truths: dict[PoseFrame, Path] = {"right": root / TRUTH_RIGHT, "left": root / TRUTH_LEFT}
-    frame = next((frame for frame, path in truths.items() if path.is_file()), None)
     listed = (path for found in cameras.values() for path in found.values())
-    all_notes = (*mounting, *noticed, *notes)
-    name, defined = root.resolve().name, (defining, listed)
-    recording = image_recording(settings, name, rig, stamps, images, defined, all_notes, source)
-    if frame is None:
-        return recording
-    truth = replace(read_tum(truths[frame]), frame=frame)
-    return with_truth(recording, truth, truths[frame], stamps)
+    defined = [*present, root / "times.txt"], listed
+    ledger = (
+        Entry(IMAGES, ", ".join(f"{k}/" for k in unlisted), "names of folders"),
+        Entry(TIMES, "stamps", str(root / "times.txt")),
+        Entry(PAIRING, "by number", "names of the images"),
+    )
+    all_notes = (*noticed, *notes)
+    return folder_recording(
+        settings, odometry, root, rig, stamps, images, defined, all_notes, ledger=ledger
+    )
 
 
 def write_image_folder(
@@ -227,30 +222,50 @@ def open_loose_images(
     given = Path(settings.path)
     folder, files = (given, None) if given.is_dir() else (given.parent, files_of(given))
     cameras = find_cameras(folder, files)
+    root, whole, notes = folder, None, tuple[str, ...]()
+    paths: Sequence[tuple[Path, ...]]
     if cameras is None:
-        raise DatasetError(
-            f"{given}: no images of a left and a right camera: two folders such as left/ and "
-            "right/, or names such as *_left.png and *_right.png; one camera alone is not enough"
-        )
-    root = cameras.folder
-    pairs, unpaired = pair_files(cameras)
-    right = [pair[0] for pair in pairs]
-    own = right[0].parent
-    stamps, assumed, lists = stamps_of(right, (own, own.parent, root), settings.fps, cameras.right)
-    rig = calibrated_rig(settings, root, first_size(right))
-    rig = numbered(rig) if cameras.numbered else rig
-    images, noticed = open_frames(pairs, rig, root)
-    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
-    also = ", ".join(" with ".join(pair) for pair in cameras.others)
-    others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
-    files_of_it = [*lists, *wheels], (path for pair in pairs for path in pair)
-    notes = (*mounting, *noticed, *others, *unpaired, *assumed)
-    name = root.resolve().name
-    found = image_recording(settings, name, rig, stamps, images, files_of_it, notes, source)
-    cameras_by = f"{own.name} is the right camera's" if own != root else "names with the side"
-    ledger = (
-        Entry("images", cameras_by, "names of folders and files"),
-        entry_of_times(lists, assumed, settings.fps),
-        entry_of_pairs(unpaired),
+        every = tuple(files or images_in(only_images(folder) or folder))
+        whole = first_size(every)
+        rig, how = _rig_of_views(settings, given, whole)
+        paths, pairing = [(path,) for path in every], Entry(PAIRING, "in one image", how)
+        sides = Entry(IMAGES, f"both views, {how}", "the calibrated size")
+        notes = (f"each image is taken as both views, {how}",)
+    else:
+        root, every = cameras.folder, cameras.right
+        paths, notes, pairing = pair_files(cameras)
+        rig = calibrated_rig(settings, root, first_size(pair[0] for pair in paths))
+        rig = numbered(rig) if cameras.numbered else rig
+        own = every[0].parent
+        cameras_by = f"{own.name} is the right camera's" if own != root else "names with the side"
+        also = ", ".join(" with ".join(pair) for pair in cameras.others)
+        if also:
+            notes = (f"also there: {also}; leave one pair of folders to take that", *notes)
+        sides = Entry(IMAGES, cameras_by, "names of folders and files", "", bool(also))
+    right = [pair[0] for pair in paths]
+    places = (right[0].parent, right[0].parent.parent, root)
+    stamps, assumed, lists, timing = stamps_of(right, places, settings.fps, every)
+    images, noticed = open_frames(paths, rig, root, whole)
+    listed = lists, (path for pair in paths for path in pair)
+    notes, ledger = (*noticed, *notes, *assumed), (sides, timing, pairing)
+    return folder_recording(
+        settings, odometry, root, rig, stamps, images, listed, notes, ledger=ledger
     )
-    return replace(found, ledger=(*found.ledger, *ledger))
+
+
+def _rig_of_views(
+    settings: LooseImagesSettings, given: Path, whole: tuple[int, int] | None
+) -> tuple[StereoRig, str]:
+    """The rig of images that show both views, and how. Raises DatasetError: there is none."""
+    own, fault = given if given.is_dir() else given.parent, ""
+    if whole is not None:
+        try:
+            return rig_of_views(whole, lambda size, _: calibrated_rig(settings, own, size))
+        except CalibrationError as error:
+            fault = f" ({error})" if settings.camera_file else ""
+    raise DatasetError(
+        f"{given}: no images of a left and a right camera, by the names of folders (left/ and "
+        "right/) or files (*_left.png and *_right.png); one camera alone is not enough, with a "
+        "gyroscope, too (of a mirror or panoramas: fgslam teach); where each image shows both "
+        f"views, give the calibration of one pair of views by --camera FILE{fault}"
+    )

@@ -37,7 +37,10 @@ _NAMED_IN_NOTES = 5
 
 
 def open_frames(
-    paths: Sequence[tuple[Path, ...]], rig: StereoRig, where: Path
+    paths: Sequence[tuple[Path, ...]],
+    rig: StereoRig,
+    where: Path,
+    whole: tuple[int, int] | None = None,
 ) -> tuple[ImageLoader, tuple[str, ...]]:
     """What reads and rectifies the images of a frame, and what was noticed.
 
@@ -47,6 +50,7 @@ def open_frames(
         paths: per frame the files of right, left[, top] camera; they need not exist.
         rig: of the cameras.
         where: the recording, in messages.
+        whole: width and height of images that show both views; None: each has its own.
 
     Raises:
         DatasetError: no frame can be read, or the cameras' images differ in size.
@@ -54,7 +58,8 @@ def open_frames(
     """
     bits, size, notes = 16, rig.image_size, []
     if paths:  # else it is refused where frames are selected
-        _check_sizes(paths, size, where)
+        if whole is None:
+            _check_sizes(paths, size, where)
         right = [frame[0] for frame in paths]
         bits, held = bits_of(right)
         notes += [*held, *mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))]
@@ -73,6 +78,10 @@ def open_frames(
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
         read = read_colour_image if colour else read_grey_image
+        if whole is not None:
+            (path,) = paths[index]
+            shown = require_size(read(path, bits), f"image {path}", *whole)
+            return rig.rectified(both_views(shown, size))
         return images_of_cameras(
             lambda path: require_size(read(path, bits), f"image {path}", *size), paths[index], rig
         )

@@ -82,7 +82,8 @@ def fitting_layouts(given: Path) -> tuple[str, ...]:
     complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(given)]
     if complete != ["rgbd", "loose_images"]:  # a depth camera's folder may have its pair, too
         complete = [kind for kind in complete if not LAYOUTS[kind].last] or complete
-    fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(given)]
+    begun = [kind for kind, layout in LAYOUTS.items() if layout.begun(given)]
+    fitting = complete or [kind for kind in begun if not LAYOUTS[kind].last] or begun
     if not fitting:
         raise DatasetError(_unknown(given))
     return tuple(fitting)
@@ -138,18 +139,19 @@ def _unknown(folder: Path) -> str:
         return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
     if inside := _recordings_in(folder):
         return f"{folder} has none of the known layouts; in it has {inside}: give that folder"
-    places = [path for path in shown_in(folder) if path.is_dir()]
-    places = [folder, *places, *(path / _INSIDE for path in places)]
-    with_images = [path for path in places if path.is_dir() and images_in(path)]
-    if len(with_images) == 1:
-        return (
-            f"{with_images[0]} holds images of one camera only; a stereo pair is the least, with "
-            "a gyroscope, too: images of a left and a right camera by the names of folders or "
-            "files (of a mirror or panoramas: fgslam teach; where each shows both views side by "
-            "side, cut them into left/ and right/, or make a film of them, which is read as it is)"
-        )
     missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
+
+
+def only_images(folder: Path) -> Path | None:
+    """The only place in a folder with images, of one camera or of both views; None without one."""
+    if (folder / "config.yaml").is_file() or _recordings_in(folder):
+        return None
+    places = [path for path in shown_in(folder) if path.is_dir()]
+    places = [folder, *places, *(path / _INSIDE for path in places)]
+    found = [path for path in places if path.is_dir() and images_in(path)]
+    mixed = any("depth" in path.stem.lower() for place in found for path in images_in(place))
+    return found[0] if len(found) == 1 and not mixed else None
 
 
 _SEARCHED = 50  # folders of one level
@@ -332,6 +334,7 @@ class CameraFiles:
         folder: that of all.
         interleaved: both cameras' files lie in one folder, and their names say which is which.
         others: further pairs of folders, which are not taken.
+        sides: what the cameras are called, left first.
     """
 
     left: tuple[Path, ...]
@@ -339,6 +342,7 @@ class CameraFiles:
     folder: Path
     interleaved: bool
     others: tuple[tuple[str, str], ...] = ()
+    sides: tuple[str, str] = ("left", "right")
 
     @property
     def numbered(self) -> bool:
@@ -523,6 +527,7 @@ LAYOUTS = {
         lambda folder: (
             () if find_cameras(folder) else ("images of a left and a right camera, by their names",)
         ),
+        lambda folder: only_images(folder) is not None,
         endings=IMAGE_SUFFIXES,
         last=True,
     ),

@@ -7,12 +7,20 @@ the recording (:func:`fgslam.datasets.opening.ledger_of`). Shown by `fgslam insp
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-UNITS = ("unit of length", "unit of depth")
-"""Entries that all lengths of a run rest on."""
+IMAGES, PAIRING, TIMES = "images", "clock and pairing", "times"
+LENGTH, DEPTH, LENS, ODOMETRY = "unit of length", "unit of depth", "lens model", "odometry"
+"""What entries are about."""
+
+_METRES, _ANGLES = r"\b[ck]?m\b", r"\bdeg\b"
+_MOVES = {
+    **dict.fromkeys((LENGTH, DEPTH), (_METRES,)),
+    **dict.fromkeys((IMAGES, PAIRING, LENS), (_METRES, _ANGLES)),
+}
+"""Units of the figures that rest on an entry; times and the frame of odometry move none."""
 
 
 class Entry(NamedTuple):
@@ -39,26 +47,10 @@ class Entry(NamedTuple):
         return f"{self.value} ({mark}{self.source}{f'; {self.option}' if self.option else ''})"
 
 
-def entry_of_times(lists: Sequence[Path], assumed: Sequence[str], fps: float | None) -> Entry:
-    """Where the stamps of image files are from: a list, the rate that is given, names, nothing."""
-    if lists:
-        return Entry("times", "stamps", ", ".join(map(str, lists)), "--fps")
-    if fps is not None:
-        return Entry("times", f"{fps:g} Hz", "--fps", "--fps")
-    guessed = any("--fps" in note for note in assumed)
-    value, source = ("even", "nothing states them") if guessed else ("stamps", "names of the files")
-    return Entry("times", value, source, "--fps", guessed)
-
-
-def entry_of_pairs(notes: Sequence[str]) -> Entry:
-    """How images of one moment were found, by what was noticed."""
-    for words, value in (
-        ("by their order", "by their order"),
-        ("and is taken so", "by stamps less a constant offset of the clocks"),
-    ):
-        if note := next((note for note in notes if words in note), ""):
-            return Entry("clock and pairing", value, note, guessed=True)
-    return Entry("clock and pairing", "by name or nearest in time, within 20 ms", "names or stamps")
+def rests_on_guess(figure: str, entries: Sequence[Entry]) -> bool:
+    """Whether a figure, by the unit in its text or its heading, rests on one of the guesses."""
+    units = {unit for entry in entries if entry.guessed for unit in _MOVES.get(entry.what, ())}
+    return any(re.search(unit, figure) for unit in units)
 
 
 def as_values(entries: Sequence[Entry]) -> list[dict[str, Any]]:

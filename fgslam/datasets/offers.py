@@ -15,8 +15,9 @@ import numpy as np
 from fgslam.core.errors import ConfigError
 from fgslam.core.files import require_output, write_bytes, write_text
 from fgslam.core.types import Trajectory
-from fgslam.datasets.folders import TRUTH_RIGHT, write_image_folder, write_poses
+from fgslam.datasets.folders import write_image_folder, write_poses
 from fgslam.datasets.images import encoded_png
+from fgslam.datasets.recording import TRUTH_RIGHT
 
 if TYPE_CHECKING:
     from fgslam.core.arrays import FloatArray, Image

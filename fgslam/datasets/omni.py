@@ -149,7 +149,7 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         raise DatasetError(f"{path} states no frame rate; convert it to a file that does")
     chosen = select_frames(frames.count, settings, settings.path)
     first = frames.load(int(chosen[0]))
-    numbers, times, timed = moments_of([frames], frames.rate, stated=False)
+    numbers, times, timed, _ = moments_of([frames], frames.rate, stated=False)
     recording = OmniRecording(
         name=path.stem,
         identity=recording_identity([path], []),
@@ -203,7 +203,7 @@ def ids_of(names: Sequence[str]) -> IntArray:
 def _times(images: Sequence[Path], folder: Path) -> FloatArray:
     """Stamps (n,) of a folder's images, by a list in it or their names; NaN without."""
     written = written_stamps(images, [folder])
-    return np.full(len(images), np.nan) if written is None else written[0]
+    return np.full(len(images), np.nan) if written is None else written.seconds
 
 
 # --------------------------------------------------------------------------------------------

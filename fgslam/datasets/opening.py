@@ -22,8 +22,8 @@ from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import body_is_camera
 from fgslam.datasets.images import Depth, DepthLoader
-from fgslam.datasets.ledger import Entry
-from fgslam.datasets.recording import Recording
+from fgslam.datasets.ledger import DEPTH, LENGTH, LENS, ODOMETRY, Entry
+from fgslam.datasets.recording import MOUNTING, Recording
 from fgslam.datasets.settings import (
     FileRecordingSettings,
     MeasurementDatasetSettings,
@@ -84,20 +84,16 @@ def ledger_of(recording: Recording, settings: Any) -> tuple[Entry, ...]:
     source = str(given or settings.path) if known is None else known.source
     entries = {entry.what: entry for entry in recording.ledger}
     if (unit := float(getattr(settings, "unit_m", 1.0))) != 1.0:
-        entries["unit of length"] = Entry("unit of length", f"{unit:g} m", "--unit", "--unit")
-    elif not {"unit of depth", "unit of length"} & entries.keys():
-        why = f"the format of {source}"
-        entries["unit of length"] = Entry("unit of length", "1 m", why, "--unit")
+        entries[LENGTH] = Entry(LENGTH, f"{unit:g} m", "--unit", "--unit")
+    elif not {DEPTH, LENGTH} & entries.keys():
+        entries[LENGTH] = Entry(LENGTH, "1 m", f"the format of {source}", "--unit")
+    lens = Entry(LENS, "none, images are rectified", source)
     if known is not None:
-        models = sorted({camera.model for camera in known.cameras})
-        stated = getattr(settings, "lens", None) is not None
-        decided = any("states the lens model" in note for note in recording.notes)
-        guessed = bool(known.guessed_lens) or decided
-        option = "dataset.lens" if guessed or stated else ""
-        lens = Entry("lens model", ", ".join(models), source, option, guessed)
-    else:
-        lens = Entry("lens model", "none, images are rectified", source)
-    entries.setdefault("lens model", lens)
+        models = ", ".join(sorted({camera.model for camera in known.cameras}))
+        asked = known.guessed_lens or getattr(settings, "lens", None)
+        option = "dataset.lens" if asked else ""
+        lens = Entry(LENS, models, source, option, bool(known.guessed_lens))
+    entries.setdefault(LENS, lens)
     stamps, truth = recording.timestamps, recording.ground_truth
     span = f"{stamps[0]:.3f} to {stamps[-1]:.3f} s"
     rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0]) if len(stamps) > 1 else np.nan
@@ -107,10 +103,9 @@ def ledger_of(recording: Recording, settings: Any) -> tuple[Entry, ...]:
         value = f"{len(truth)} of {len(stamps)} frames{its}"
         entries["truth"] = Entry("truth", value, settings.path)
     if recording.odometry_source is not None:
-        ahead = next((n for n in recording.notes if "taken to look straight ahead" in n), "")
         frame = "of the camera" if body_is_camera(recording.rig.bTc) else "of the robot's body"
-        why, option = ahead or settings.path, "dataset.camera_yaw_deg, dataset.lever_arm_m"
-        entries["odometry"] = Entry("odometry", f"its frame is {frame}", why, option, bool(ahead))
+        stated = Entry(ODOMETRY, f"its frame is {frame}", settings.path, MOUNTING)
+        entries.setdefault(ODOMETRY, stated)
     return tuple(entries.values())
 
 
@@ -134,7 +129,8 @@ def _by_lens(
         f"the first pairs agree to {rows[best]:.2g} px, by {worse} to {rows[worse]:.2g} "
         f"(dataset.lens={worse} states otherwise)"
     )
-    return replace(chosen, notes=(note, *chosen.notes))
+    entry = Entry(LENS, best, note, "dataset.lens", guessed=True)
+    return replace(chosen, notes=(note, *chosen.notes), ledger=(*chosen.ledger, entry))
 
 
 _SMALLEST_PX = 8  # SIFT finds nothing in less

@@ -29,7 +29,7 @@ from fgslam.core.sensors import body_is_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
-from fgslam.datasets.ledger import Entry, entry_of_pairs
+from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
 from fgslam.datasets.odometry import (
     SPEED_COLUMNS,
     gyroscope_odometry,
@@ -99,7 +99,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     rig = mounted(loaded_rig(settings, *files, size=first_size(cameras[0][1])), settings)
     (at_right, right), (at_left, left) = (cameras[k] for k in rig.sources[:2])
     others = [("left", str(left[0].parent), at_left)]
-    rows, paired = pair_stamps(at_right, others, str(right[0].parent))
+    rows, paired, pairing = pair_stamps(at_right, others, str(right[0].parent))
     paths = [(right[i], left[j]) for i, j in rows.tolist()]
     images, noticed = open_frames(paths, rig, root)
     sensors = [*folders, root / "imu0"]
@@ -110,26 +110,21 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         of_noise = (own, root.parent / "dso" / "imu_config.yaml")
         noise = next((path for path in of_noise if path.is_file()), None)
         source = gyroscope_odometry(gyroscope, own if own.is_file() else None, noise, odometry)
-    recording = image_recording(
-        settings,
-        root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
-        rig,
-        at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS,
-        images,
-        (
-            [path for path in defining if path.is_file()],
-            [path for pair in paths for path in pair if path.is_file()],
-        ),
-        (*noticed, *paired),
-        source,
+    name = root.resolve().parent.name if root.name == "mav0" else root.resolve().name
+    stamps = at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS
+    identity = (
+        [path for path in defining if path.is_file()],
+        [path for pair in paths for path in pair if path.is_file()],
     )
-    sides = Entry("images", f"{right[0].parent.parent.name} is right", "their poses (T_BS)")
-    ledger = (sides, Entry("times", "stamps", "data.csv"), entry_of_pairs(paired))
-    recording = replace(recording, ledger=(*recording.ledger, *ledger))
+    sides = Entry(IMAGES, f"{right[0].parent.parent.name} is right", "their poses (T_BS)")
+    ledger = (sides, Entry(TIMES, "stamps", "data.csv"), pairing)
+    recording = image_recording(
+        settings, name, rig, stamps, images, identity, (*noticed, *paired), ledger,
+        odometry_source=source,
+    )  # fmt: skip
     places = ("state_groundtruth_estimate0", "mocap0")  # TUM-VI tracks the gyroscope
     for place in places[: 1 if body_is_camera(rig.bTc) else 2]:
         if (body := read_body_truth(root / place)) is not None:
-            stamps = at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS
             return with_truth(recording, body, root / place / "data.csv", stamps)
     return recording
 
@@ -240,7 +235,12 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     images, noticed = open_frames(paths, rig, folder)
     listed = [path for found in cameras.values() for path in found.values()]
     name, files = f"KITTI {settings.sequence}", ([calibration, times], listed)
-    recording = image_recording(settings, name, rig, stamps, images, files, noticed)
+    ledger = (
+        Entry(IMAGES, ", ".join(f"{name}/" for name in cameras), "names of folders"),
+        Entry(TIMES, "stamps", str(times)),
+        Entry(PAIRING, "by number", "names of the images"),
+    )
+    recording = image_recording(settings, name, rig, stamps, images, files, noticed, ledger)
     poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
     if poses is None:
         return recording
@@ -297,8 +297,8 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
             "each with data/ or data_rect/); unpack the drive's synced and rectified data"
         )
     left, right = (_raw_images(drive / name) for name in names)
-    pairs, unpaired = pair_files(CameraFiles(left, right, drive, interleaved=False))
-    stamps, assumed, lists = stamps_of(
+    pairs, unpaired, pairing = pair_files(CameraFiles(left, right, drive, interleaved=False))
+    stamps, assumed, lists, timing = stamps_of(
         [path for path, _ in pairs], (drive / names[1],), None, right
     )
     rig, iTc = _raw_rig(settings, drive, names, first_size(right))
@@ -314,7 +314,10 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     if of_unit is not None:
         truth, speeds = of_unit
         source = recorded_motions(str(speeds.path), lambda: motions_of(speeds, odometry))
-    recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
+    ledger = Entry(IMAGES, f"{names[1]} is right", "names of folders"), timing, pairing
+    recording = image_recording(
+        settings, name, rig, stamps, images, files, notes, ledger, odometry_source=source
+    )
     if of_unit is None or iTc is None:
         return recording
     path, known = drive / "oxts", replace(truth, frame="body")

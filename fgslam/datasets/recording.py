@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
-from fgslam.datasets.images import DepthLoader, ImageLoader
-from fgslam.datasets.ledger import Entry
+from fgslam.datasets.images import DepthLoader, ImageLoader, shown_together
+from fgslam.datasets.ledger import LENGTH, ODOMETRY, Entry
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
     OdometrySource,
@@ -37,9 +37,11 @@ from fgslam.datasets.settings import (
     RecordingSettings,
     SyntheticOdometrySettings,
 )
-from fgslam.datasets.times import rows_at, time_unit, trajectory_at_frames
+from fgslam.datasets.times import read_tum, rows_at, time_unit, trajectory_at_frames
 
 Rig = TypeVar("Rig", bound=CameraRig)
+MOUNTING = "dataset.camera_yaw_deg, dataset.lever_arm_m"
+"""Settings that put the camera on the body of odometry."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,7 +142,8 @@ def image_recording(
     load_images: ImageLoader,
     files: tuple[Iterable[Path], Iterable[Path]],
     notes: tuple[str, ...],
-    odometry_source: OdometrySource | None = None,
+    ledger: tuple[Entry, ...] = (),
+    **more: Any,
 ) -> Recording:
     """Recording of those frames that the settings select; what all readers of images end in.
 
@@ -152,18 +155,18 @@ def image_recording(
         load_images: reads the images of a frame by its number among all.
         files: that identify it: by their content, and by their names (:func:`recording_identity`).
         notes: what was tolerated; the rig's own remarks are put before them.
-        odometry_source: where the body's motions come from.
+        ledger: what the reader alone knows.
+        more: further attributes of a :class:`Recording`.
 
     Raises:
         DatasetError: no frame is selected.
     """
     indices = select_frames(len(stamps), settings, settings.path)
     plain, rectifier = rig, None
-    ledger: tuple[Entry, ...] = ()
     if isinstance(rig, StereoRig):
         if rig.format.startswith("OpenCV"):
-            why = f"{rig.format} states none"
-            ledger = (Entry("unit of length", "1 m", why, "--unit", True),)
+            entry = Entry(LENGTH, "1 m", f"{rig.format} states none", "--unit", guessed=True)
+            ledger = (entry, *ledger)
         plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
     return Recording(
         name,
@@ -173,11 +176,56 @@ def image_recording(
         notes,
         indices,
         load_images,
-        odometry_source=odometry_source,
         rectifier=rectifier,
         ledger=ledger,
         calibration=getattr(rig, "file", ""),
+        **more,
     )
+
+
+TRUTH_RIGHT, TRUTH_LEFT = "gt_right_cam.txt", "gt_left_cam.txt"
+_TRUTHS: Mapping[str, PoseFrame | None] = {
+    TRUTH_RIGHT: "right",
+    TRUTH_LEFT: "left",
+    "groundtruth.txt": None,
+}
+"""Files of true poses in a folder, and of which camera; None: as data sets give them."""
+
+
+def folder_recording(
+    settings: CalibratedSettings,
+    odometry: RecordedOdometrySettings,
+    root: Path,
+    rig: StereoRig,
+    stamps: FloatArray,
+    load_images: ImageLoader,
+    files: tuple[Sequence[Path], Iterable[Path]],
+    notes: tuple[str, ...],
+    **more: Any,
+) -> Recording:
+    """As :func:`image_recording`, with the odometry and the truth that lie in a folder.
+
+    Where odometry is another body's and the calibration is of the cameras alone, these look
+    straight ahead from its origin.
+
+    Raises:
+        DatasetError: as there, or there are several files of odometry, or the truth is malformed.
+    """
+    contents, listed = files
+    if (file := find_odometry(root)) is not None:
+        more["odometry_source"], contents = file_odometry(file, odometry), (*contents, file)
+        stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
+        # A gyroscope is in the camera's own box, wheels turn about another axis.
+        if not stated and not is_of_gyroscope(file) and body_is_camera(rig.bTc):
+            guess = looks_ahead(f"the body of {file}")
+            rig = replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+            notes, more["ledger"] = (guess.source, *notes), (*more["ledger"], guess)
+    name, files = root.resolve().name, (contents, listed)
+    found = image_recording(settings, name, rig, stamps, load_images, files, notes, **more)
+    if (path := next((root / n for n in _TRUTHS if (root / n).is_file()), None)) is None:
+        return found
+    truth = replace(read_tum(path), frame=_TRUTHS[path.name] or found.truth_frame)
+    return with_truth(found, truth, path, stamps)
 
 
 def with_truth(
@@ -309,6 +357,31 @@ def calibrated_rig(
         ) from None
 
 
+T = TypeVar("T")
+
+
+def rig_of_views(
+    whole: tuple[int, int], rig_of: Callable[[tuple[int, int], tuple[int, int]], T]
+) -> tuple[T, str]:
+    """The rig of images of a size that show both views, and in words how they show them.
+
+    Args:
+        whole: width and height of the images.
+        rig_of: the rig of views of a size, so many next to and above each other; CalibrationError
+            where the calibration is of other ones.
+
+    Raises:
+        CalibrationError: it is of no part of the images.
+    """
+    fault = None
+    for name, columns, rows in shown_together(whole):
+        try:
+            return rig_of((whole[0] // columns, whole[1] // rows), (columns, rows)), name
+        except CalibrationError as error:
+            fault = fault or error
+    raise fault or CalibrationError("no views")
+
+
 def loaded_rig(
     settings: CalibratedSettings,
     *files: Path,
@@ -378,30 +451,13 @@ def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
     return replace(rig, bTc=pose(level, np.array(lever_arm, np.float64)))
 
 
-def on_wheels(
-    rig: Rig, root: Path, settings: CalibratedSettings, odometry: RecordedOdometrySettings
-) -> tuple[Rig, tuple[str, ...], list[Path], OdometrySource | None]:
-    """The rig on the body that the odometry in a recording's folder moves, and that odometry.
-
-    Where the calibration is of the cameras alone, they look straight ahead from its origin.
-
-    Returns:
-        The rig, what is assumed of its place on the body, the file of odometry, and its motions.
-    """
-    file = find_odometry(root)
-    if file is None:
-        return rig, (), [], None
-    source = file_odometry(file, odometry)
-    stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
-    # A gyroscope is in the camera's own box, wheels turn about another axis.
-    if stated or is_of_gyroscope(file) or not body_is_camera(rig.bTc):
-        return rig, (), [file], source
-    text = f"nothing states where the camera sits on the body of {file}: {LOOKS_AHEAD}"
-    return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,), [file], source
-
-
-LOOKS_AHEAD = (
-    "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
-    "otherwise)"
-)
-"""What is assumed of a camera where nothing states how it sits on the body that odometry moves."""
+def looks_ahead(body: str) -> Entry:
+    """What is assumed of a camera where nothing states how it sits on the body of odometry."""
+    return Entry(
+        ODOMETRY,
+        "its frame is of the robot's body",
+        f"nothing states where the camera sits on {body}: it is taken to look straight ahead from "
+        "there (dataset.camera_yaw_deg and lever_arm_m say otherwise)",
+        MOUNTING,
+        guessed=True,
+    )

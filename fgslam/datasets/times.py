@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from fgslam.datasets.layouts import (
     numbers_in,
     time_parts,
 )
+from fgslam.datasets.ledger import PAIRING, TIMES, Entry
 
 NANOSECONDS = 1e-9
 
@@ -238,34 +239,39 @@ def pair_stamps(
     reference: IntArray,
     others: Sequence[tuple[str, str, IntArray]],
     name: str,
-) -> tuple[IntArray, tuple[str, ...]]:
+    side: str = "right",
+) -> tuple[IntArray, tuple[str, ...], Entry]:
     """Rows (n, 1 + others) of images that are each other's nearest in time, and notes.
 
     Args:
         reference: stamps of the right camera in nanoseconds, increasing.
         others: side, name and stamps of each other camera.
         name: of the right camera, in messages.
+        side: of the right camera.
 
     Returns:
-        The rows, those of the reference first; and notes on images left without a partner and on
-        how far pairs differ.
+        The rows, those of the reference first; notes on images left without a partner and on how
+        far pairs differ; and how they were found.
 
     Raises:
         DatasetError: no image is left that has a partner of each camera.
     """
     rows = np.arange(len(reference))[:, None]
     notes: list[str] = []
-    for side, other, stamps in others:
+    entry = Entry(PAIRING, f"nearest in time, within {1e3 * TOLERANCE_S:g} ms", "stamps")
+    for its_side, other, stamps in others:
         right = reference[rows[:, 0]]
         kept, partner, skew = _partners(right, stamps)
         if len(kept) < _MOST_OF_ALL * min(len(right), len(stamps)) / 2 and (
             (away := _clock_offset(right, stamps)) is not None
         ):
             kept, partner, skew = _partners(right, stamps - away)
-            notes.append(
+            note = (
                 f"the clock of {other} is {abs(NANOSECONDS * away):.6g} s "
                 f"{'ahead of' if away > 0 else 'behind'} that of {name} throughout, and is taken so"
             )
+            notes.append(note)
+            entry = Entry(PAIRING, "by stamps less a constant offset", note, guessed=True)
         if len(kept) == 0:
             spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s"
                      for s in (right, stamps)]  # fmt: skip
@@ -277,7 +283,7 @@ def pair_stamps(
             )
         notes += [
             f"{n} {camera} images have no partner within {1e3 * TOLERANCE_S:g} ms and are left out"
-            for camera, n in (("right", len(right) - len(kept)), (side, len(stamps) - len(kept)))
+            for camera, n in ((side, len(right) - len(kept)), (its_side, len(stamps) - len(kept)))
             if n
         ]
         if (worst := float(skew[kept].max())) > _NAMED_SKEW_S:
@@ -287,7 +293,7 @@ def pair_stamps(
                 "synchronised measure wrong depths while they turn"
             )
         rows = np.column_stack([rows[kept], partner[kept]])
-    return rows, tuple(notes)
+    return rows, tuple(notes), entry
 
 
 def _partners(right: IntArray, stamps: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
@@ -334,15 +340,35 @@ _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanosecon
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
 
 
+class Stamps(NamedTuple):
+    """Seconds (n,) of images in their order, notes, the lists they are from, where that is stated.
+
+    What a reader takes from the lists counts to what identifies a recording.
+    """
+
+    seconds: FloatArray
+    notes: tuple[str, ...]
+    lists: tuple[Path, ...]
+    entry: Entry
+
+
+def even_stamps(places: IntArray, fps: float | None, lacking: str = "no list of times") -> Stamps:
+    """Stamps of images by their places (n,) at a rate; None where it is unknown: 10 is assumed."""
+    rate = fps or ASSUMED_FPS
+    entry = Entry(TIMES, f"{rate:g} Hz", "--fps", "--fps")
+    note = f"{lacking}: taken as {rate:g} frames a second (--fps states otherwise)"
+    if fps is None:
+        entry = Entry(TIMES, "even", "nothing states them", "--fps", guessed=True)
+    return Stamps(places / rate, () if fps else (note,), (), entry)
+
+
 def stamps_of(
     images: Sequence[Path],
     folders: Sequence[Path],
     fps: float | None,
     every: Sequence[Path] | None = None,
-) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]]:
-    """Seconds (n,) of images in their order, notes, and the list they were read from, if any.
-
-    Taken from a list of times in one of the folders, from names that are times, or by the rate.
+) -> Stamps:
+    """Stamps from a list of times in one of the folders, from names that are times, or by the rate.
 
     Args:
         images: one file a frame.
@@ -354,31 +380,30 @@ def stamps_of(
         DatasetError: the list is malformed, or lacks an image.
     """
     written = written_stamps(images, folders, every) if fps is None else None
-    if written is not None:
-        return written
-    rate = fps or ASSUMED_FPS
-    note = f"no list of times: taken as {rate:g} frames a second (--fps states otherwise)"
     place = {path: k for k, path in enumerate(every or images)}
-    return np.array([place[path] for path in images]) / rate, () if fps else (note,), ()
+    return written or even_stamps(np.array([place[path] for path in images]), fps)
 
 
 def written_stamps(
     images: Sequence[Path], folders: Sequence[Path], every: Sequence[Path] | None = None
-) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
+) -> Stamps | None:
     """As :func:`stamps_of`, from a list or from names; None where neither states anything."""
     for path in (folder / name for folder in folders for name in LISTS):
         if path.is_file():
-            return (*_in_seconds(_listed(path, images, every or images), str(path)), (path,))
+            entry = Entry(TIMES, "stamps", str(path), "--fps")
+            read = _in_seconds(_listed(path, images, every or images), str(path))
+            return Stamps(*read, (path,), entry)
     names = [image.stem for image in images]
     by_date = _dates(names)
+    entry = Entry(TIMES, "stamps", "names of the images", "--fps")
     if by_date is not None:
-        return by_date, ("times are the dates in the names of the images",), ()
+        return Stamps(by_date, ("times are the dates in the names of the images",), (), entry)
     parts = time_parts(names) if len(names) > 1 else None
     if parts is None:
         return None
     texts = [f"{whole}.{part}" for whole, part in zip(*parts, strict=True)]
     mend = "two names of a folder are one time: remove one"
-    return (*_in_seconds(texts, "names of the images", mend), ())
+    return Stamps(*_in_seconds(texts, entry.source, mend), (), entry)
 
 
 def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, float]:
@@ -532,8 +557,8 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
 # Pairs of image files by their names, by time, by order
 
 
-Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
-"""Files (right, left) of each moment, and notes on what is left out."""
+Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...], Entry]
+"""Files (right, left) of each moment, notes on what is left out, and how they were found."""
 
 
 def pair_files(found: CameraFiles, at_once: bool = True) -> Pairs:
@@ -581,13 +606,15 @@ def _by_names(found: CameraFiles, keys: Iterable[_Key]) -> Pairs | None:
         common = [name for name in right if name in left]
         unique = len(right) == len(found.right) and len(left) == len(found.left)
         if unique and len(common) >= max(1, min(len(right), len(left)) // 2):
-            alone = (("right", len(right) - len(common)), ("left", len(left) - len(common)))
+            counts = (len(left) - len(common), len(right) - len(common))
+            alone = reversed(list(zip(found.sides, counts, strict=True)))
             notes = tuple(
                 f"{n} {camera} images have no partner of their name and are left out"
                 for camera, n in alone
                 if n
             )
-            return tuple((right[name], left[name]) for name in common), notes
+            pairs = tuple((right[name], left[name]) for name in common)
+            return pairs, notes, Entry(PAIRING, "by name", "names of the images")
     return None
 
 
@@ -600,13 +627,18 @@ def _by_order(found: CameraFiles) -> Pairs:
         )
     pairs = tuple(zip(found.right, found.left, strict=True))
     if all(numbers_in(right.stem) == numbers_in(left.stem) != [] for right, left in pairs):
-        return pairs, ()  # frame000012 and depth000012 are of one moment
-    return pairs, ("left and right images are paired by their order: their names do not match",)
+        # frame000012 and depth000012 are of one moment.
+        return pairs, (), Entry(PAIRING, "by number", "names of the images")
+    both = " and ".join(found.sides)
+    note = f"{both} images are paired by their order: their names do not match"
+    return pairs, (note,), Entry(PAIRING, "by their order", note, guessed=True)
 
 
 def _by_time(found: CameraFiles, right: IntArray, left: IntArray) -> Pairs:
     """The nearest in time."""
-    others = [("left", f"{found.folder}, left", left)]
-    rows, notes = pair_stamps(right, others, f"{found.folder}, right")
-    note = "left and right images are paired by the times that their names are"
-    return tuple((found.right[i], found.left[j]) for i, j in rows.tolist()), (note, *notes)
+    of_left, of_right = (f"{found.folder}, {side}" for side in found.sides)
+    rows, notes, entry = pair_stamps(
+        right, [(found.sides[0], of_left, left)], of_right, found.sides[1]
+    )
+    note = f"{' and '.join(found.sides)} images are paired by the times that their names are"
+    return tuple((found.right[i], found.left[j]) for i, j in rows.tolist()), (note, *notes), entry

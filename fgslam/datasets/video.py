@@ -25,14 +25,16 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OutputError
 from fgslam.core.files import remove_left_behind, replacing
 from fgslam.core.sides import differ_in_number
-from fgslam.datasets.images import both_views, require_size, shown_together
+from fgslam.datasets.images import both_views, require_size
 from fgslam.datasets.layouts import films_in
+from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
 from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
     image_recording,
     in_order,
     numbered,
+    rig_of_views,
 )
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
 from fgslam.datasets.times import NANOSECONDS, pair_stamps
@@ -61,7 +63,7 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"{paths[0]} states no frame rate; say it: --fps RATE")
     views, rig, assumed = _views(settings, films, paths[0].parent)
-    shown, times, timed = moments_of(films, rate, settings.fps is not None)
+    shown, times, timed, pairing = moments_of(films, rate, settings.fps is not None)
     size = rig.image_size
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
@@ -76,7 +78,10 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
 
     notes = (*(note for film in films for note in film.notes), *assumed, *timed)
     name = given.stem if len(films) == 1 else given.resolve().name.replace("*", "")
-    return image_recording(settings, name, rig, times, load, ([], paths), notes)
+    sides = Entry(IMAGES, ", ".join(film.name for film in films), "names of the films")
+    timing = Entry(TIMES, f"{rate:g} Hz", "--fps" if settings.fps else paths[0].name, "--fps")
+    ledger = (sides, timing, pairing)
+    return image_recording(settings, name, rig, times, load, ([], paths), notes, ledger)
 
 
 def _with_last(image: Image, size: tuple[int, int]) -> Image:
@@ -101,19 +106,14 @@ def _views(
         rig, order = _films_of_cameras(rig, films, folder)
         return lambda *numbers: tuple(films[k].load(numbers[k]) for k in order), rig, assumed
     film = films[0]
-    fault: CalibrationError | None = None
-    for name, columns, rows in shown_together((width, height)):
-        size = (width // columns, height // rows)
-        try:
-            rig, assumed = _rig(settings, folder, size, (columns, rows))
-        except CalibrationError as error:
-            fault = fault or error
-            continue
-
-        def halves(number: int, size: tuple[int, int] = size) -> tuple[Image, ...]:
-            return both_views(film.load(number), size)
-
-        return halves, rig, (*assumed, f"the film is taken as {name}")
+    try:
+        (rig, assumed, size), name = rig_of_views(
+            (width, height), lambda size, views: (*_rig(settings, folder, size, views), size)
+        )
+        note = f"the film is taken as {name}"
+        return lambda number: both_views(film.load(number), size), rig, (*assumed, note)
+    except CalibrationError as error:
+        fault = error
     with suppress(CalibrationError):
         calibrated_rig(settings, folder, (width, height))
         raise DatasetError(
@@ -127,7 +127,7 @@ def _views(
             f"{film.name} shows the round picture of one mirror or fisheye, no stereo pair; routes "
             f"of such a camera: fgslam teach {settings.path} --camera FILE --out ROUTE"
         )
-    raise fault or DatasetError(f"{folder}: no film")
+    raise fault
 
 
 def _films_of_cameras(
@@ -194,9 +194,9 @@ _UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that coun
 _LASTING = 15  # frames over which films part, not only jitter: at most half of the film
 
 
-Moments: TypeAlias = tuple[IntArray, FloatArray, tuple[str, ...]]
+Moments: TypeAlias = tuple[IntArray, FloatArray, tuple[str, ...], Entry]
 """Numbers (n, films) of the frames of each film that are shown at one time, these times (n,) in
-seconds from the first film's beginning on, and notes on how they were found."""
+seconds from the first film's beginning on, and notes on how they were found and how that is."""
 
 
 def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
@@ -216,13 +216,13 @@ def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
     either = (film.even() if its is None else its for film, its in zip(films, own, strict=True))
     known = [times for times in either if times is not None]
     if stated or len(known) < len(films) or not any(_part(known[0], its) for its in known[1:]):
-        how, (numbers, times, reported) = "number", _by_number(films, own, rate)
+        how, (numbers, times, reported, entry) = "number", _by_number(films, own, rate)
     else:  # of the frames that are each other's nearest
         how = "time"
         left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
         sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
         others = [(side, film.name, stamps) for side, film, stamps in sides]
-        rows, reported = pair_stamps(right, others, films[1].name)
+        rows, reported, entry = pair_stamps(right, others, films[1].name)
         numbers = rows[:, [1, 0, *range(2, len(films))]]
         times = known[0][numbers[:, 0]]
     count, all_ = ("two", "both") if len(films) == 2 else ("three", "all")
@@ -236,7 +236,7 @@ def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
         if abs(first.rate - film.rate) > 1e-3 * first.rate:
             text = f"the left film has {first.rate:g} frames a second, the {side} {film.rate:g}"
             notes.append(text)
-    return numbers, times, (*notes, *reported)
+    return numbers, times, (*notes, *reported), entry._replace(source=notes[0], guessed=True)
 
 
 def _part(left: FloatArray, right: FloatArray) -> bool:
@@ -258,17 +258,18 @@ def _by_number(films: list[VideoFrames], own: list[FloatArray | None], rate: flo
     even = np.arange(count, dtype=np.int64) / rate
     numbers = np.repeat(np.arange(count, dtype=np.int64)[:, None], len(films), axis=1)
     shown = [times[:count] for times in own if times is not None]
+    entry = Entry(PAIRING, "by number" if len(films) > 1 else "in one image", "the film")
     if count < 2 or len(shown) < len(films):
-        return numbers, even, ()
+        return numbers, even, (), entry
     notes: tuple[str, ...] = ()
     apart = max((float(np.abs(shown[0] - its).max()) for its in shown[1:]), default=0.0)
     if apart > _UNEVEN / rate:
         notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
     if np.abs(shown[0] - even).max() <= _UNEVEN / rate:
-        return numbers, even, notes
+        return numbers, even, notes, entry
     steps = 1e3 * np.diff(shown[0])
     note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
-    return numbers, shown[0], (note, *notes)
+    return numbers, shown[0], (note, *notes), entry
 
 
 # --------------------------------------------------------------------------------------------

@@ -192,7 +192,7 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
                 f"{folders[0]}: images of two cameras cannot be distinguished there; name them "
                 "left and right, or give a folder for each"
             )
-        pairs, notes = pair_files(found, at_once=False)
+        pairs, notes, _ = pair_files(found, at_once=False)
         return [(left, right) for right, left in pairs], notes
     listed = [images_in(folder) for folder in folders]
     counts = [len(images) for images in listed]

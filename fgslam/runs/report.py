@@ -29,7 +29,7 @@ from fgslam.core.types import (
     read_covariances,
 )
 from fgslam.core.yaml_text import plain_values
-from fgslam.datasets.ledger import of_values
+from fgslam.datasets.ledger import Entry, of_values, rests_on_guess
 from fgslam.evaluation.judging import (
     Answer,
     JudgedClosure,
@@ -411,7 +411,9 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
             (e.what, (e.value, "guessed: " * e.guessed + e.source, e.option or "-"))
             for e in entries
         )
-        tables.append(TextTable("ledger", "What the figures rest on", "", _LEDGER_COLUMNS, rows))
+        tables = [on_guesses(table, entries) for table in tables]
+        heading = "What the figures rest on (figures with * on a guess)"
+        tables.append(TextTable("ledger", heading, "", _LEDGER_COLUMNS, rows))
     provenance = _section(config, "provenance")
     dataset = str(_section(provenance, "dataset").get("name") or "")
     frames, odometry = metrics.get("frames"), metrics.get("odometry")
@@ -469,6 +471,13 @@ def _stages(path: Path) -> dict[str, FloatArray] | None:
         return None
     stages = {name: table["milliseconds"][own] for name, own in rows.items()}
     return {"timestamp": table["timestamp"][next(iter(rows.values()))], **stages}
+
+
+def on_guesses(table: TextTable, entries: Sequence[Entry]) -> TextTable:
+    """The table with a mark at the columns whose figures rest on a guess."""
+    columns = (replace(column, name=column.name + " *" * rests_on_guess(column.name, entries))
+               for column in table.columns)  # fmt: skip
+    return replace(table, columns=tuple(columns))
 
 
 def _read_config(path: Path | None) -> tuple[str, dict[str, Any]]:

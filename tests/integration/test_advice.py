@@ -183,7 +183,7 @@ CONVERT = ("camera convert", "{}/out.yaml")
 ADVICE = {
     "rate of counters": Advice(depth, "frames a second (--fps states otherwise)", "--fps 30"),
     "counters in associations": Advice(
-        lambda root: depth(root, list_=True), "(--fps states another)", "--fps 30"
+        lambda root: depth(root, list_=True), "(--fps states otherwise)", "--fps 30"
     ),
     "times of too few images": Advice(
         times_of_two, "leave it out and say --fps", "--fps 20", without("times.txt")

@@ -30,7 +30,7 @@ from fgslam.core.log import (
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig, moved_pixels
 from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures
-from fgslam.datasets.ledger import UNITS, Entry, as_values
+from fgslam.datasets.ledger import Entry, as_values, rests_on_guess
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, align, associate
@@ -683,10 +683,13 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         pairs = zip(bias["rates"], bias["sigmas"], strict=True)
         words = ", ".join(f"{rate:.3f} +- {sigma:.3f}" for rate, sigma in pairs)
         rows["gyroscope bias, x y z"] = f"{words} deg/s"
-    if guessed := [e for e in outputs.ledger if e.guessed and e.what in UNITS]:
-        rows = {name + " *" * (text.endswith((" cm", " m")) or " cm" in text): text
-                for name, text in rows.items()}  # fmt: skip
-        rows["* rests on a guess"] = "\n".join(f"{e.what}: {e.value} ({e.option})" for e in guessed)
+    guessed = [entry for entry in outputs.ledger if entry.guessed]
+    on_guess = [rests_on_guess(text, guessed) for text in rows.values()]
+    if any(on_guess):
+        rows = {name + " *" * mark: text
+                for (name, text), mark in zip(rows.items(), on_guess, strict=True)}  # fmt: skip
+        why = (f"{e.what}: {e.value}{f' ({e.option})' * bool(e.option)}" for e in guessed)
+        rows["* rests on a guess"] = "\n".join(why)
     remark = f"\n{outputs.remark}" if outputs.remark else ""
     heading = f"{outputs.config.name}: {outputs.title}{remark}"
     cells = tuple((name, (value,)) for name, value in rows.items())

@@ -577,7 +577,7 @@ def paired(root: Path, lefts: list[str], rights: list[str], **options: Any) -> l
             (root / folder / f"{name}.png").touch()
     found = find_cameras(root)
     assert found is not None
-    pairs, notes = pair_files(found, **options)
+    pairs, notes, _ = pair_files(found, **options)
     return [[left.stem, right.stem] for right, left in pairs] + [list(notes)]
 
 
@@ -766,7 +766,7 @@ def test_one_folder_may_number_the_cameras_last(tmp_path: Path) -> None:
             save(tmp_path / f"{k}_{camera}.png", picture(10 * k + camera))
     found = find_cameras(tmp_path)
     assert found is not None
-    pairs, notes = pair_files(found)
+    pairs, notes, _ = pair_files(found)
     names = [(left.name, right.name) for right, left in pairs]
     assert names == [("0_0.png", "0_1.png"), ("2_0.png", "2_1.png"), ("10_0.png", "10_1.png")]
     assert notes == ()

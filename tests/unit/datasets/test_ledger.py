@@ -11,7 +11,7 @@ from bags import stereo, write_bag
 from dataset_builders import HEIGHT, WIDTH, loose, picture, save, write_calibration
 
 from fgslam.datasets.layouts import recognise_layout
-from fgslam.datasets.ledger import Entry, as_values, entry_of_pairs, of_values
+from fgslam.datasets.ledger import PAIRING, Entry, as_values, of_values, rests_on_guess
 from fgslam.datasets.opening import open_recording
 from fgslam.runs.config import make_config
 
@@ -65,10 +65,26 @@ def test_topics_are_guessed_or_named(tmp_path: Path) -> None:
 
 
 def test_pairs_by_order_or_an_offset_are_guesses_and_entries_are_kept(tmp_path: Path) -> None:
-    assert not entry_of_pairs(()).guessed
-    by_order = entry_of_pairs(("left and right images are paired by their order: names differ",))
+    by_name = ledger(loose(tmp_path / "a", lambda k: (f"cam0/{k}.png", f"cam1/{k}.png")))[PAIRING]
+    assert (by_name.value, by_name.guessed) == ("by name", False)
+    late = loose(tmp_path / "b", lambda k: (f"left/a{k}.png", f"right/b{2 * k}c.png"))
+    by_order = ledger(late)[PAIRING]
     assert by_order.guessed
     assert "guessed: left and right" in by_order.shown
+    bag = write_bag(tmp_path / "late.bag", stereo(skew_ns=7_000_000_000))
+    assert ledger(bag)[PAIRING].value == "by stamps less a constant offset"
+    assert ledger(bag)[PAIRING].guessed
     stored = json.loads(json.dumps(as_values([by_order])))
     assert of_values(stored) == (by_order,)
     assert of_values(None) == of_values([{"what": 1}]) == ()
+
+
+def test_figures_in_metres_rest_on_the_unit_and_angles_do_not() -> None:
+    unit = Entry("unit of length", "1 m", "OpenCV states none", "--unit", guessed=True)
+    order = Entry(PAIRING, "by their order", "names", guessed=True)
+    assert rests_on_guess("12.34 cm", [unit])
+    assert rests_on_guess("final ATE (cm)", [unit])
+    assert not rests_on_guess("0.012 deg", [unit])
+    assert not rests_on_guess("23 of 24 frames", [unit, order])
+    assert rests_on_guess("yaw 0.01 deg", [order])
+    assert not rests_on_guess("12.34 cm", [unit._replace(guessed=False)])
