@@ -25,6 +25,7 @@ from fgslam.cameras.trees import (
     camera_of,
     flat_numbers,
     intrinsic_matrix,
+    listed_lenses,
     read_json,
 )
 from fgslam.core.arrays import FloatArray
@@ -42,7 +43,7 @@ _OWN = Row(
     size=("width", "height"),
     matrix="matrix",
     kind=("model",),
-    lenses={model: (model, ("parameters",)) for model in LENSES},
+    lenses=listed_lenses("parameters", *LENSES),
 )
 
 # --------------------------------------------------------------------------------------------
@@ -88,10 +89,7 @@ def raw_values(calibration: Calibration) -> dict[str, Any]:
     """Keys and values of fgslam's own ``calib.json``."""
     cameras = [
         {
-            "name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "model": camera.model,
+            **{name: getattr(camera, name) for name in ("name", "width", "height", "model")},
             "matrix": camera.matrix.tolist(),
             "parameters": camera.distortion.tolist(),
             "bTc": camera.bTc.tolist(),
@@ -134,9 +132,8 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
     values = read_json_object(path)
     if values.get("rectified") is False:
         raise CalibrationError(
-            f"{path} states that the images are not rectified; rectify them first (rows of the "
-            "left and right image must agree), or give the raw cameras' calibration by --camera "
-            "FILE"
+            f"{path} states that the images are not rectified; rectify them first, or "
+            "give the raw cameras' calibration by --camera FILE"
         )
     _require_perspective(path, values.get("view", "perspective"))
     bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
@@ -144,23 +141,16 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
         found = flat_numbers(values["bTc"])
         if found is None or len(found) != 16 or not is_rigid(found.reshape(4, 4)):
             raise CalibrationError(
-                f"{path}: bTc must be a rigid 4x4 matrix (the pose of the right camera in the "
-                "body); correct or remove it"
+                f"{path}: bTc must be a rigid 4x4 matrix (right camera in body); correct it"
             )
         bTc = found.reshape(4, 4)
-    return CameraRig(
-        width=pixels(path, values, "width"),
-        height=pixels(path, values, "height"),
-        fx=number(path, values, "fx", positive=True),
-        fy=number(path, values, "fy", positive=True),
-        cx=number(path, values, "cx"),
-        cy=number(path, values, "cy"),
-        baseline=number(path, values, "baseline_m", positive=True),
-        vertical_baseline=(
-            number(path, values, "vertical_baseline_m", positive=True) if three_cameras else None
-        ),
-        bTc=bTc,
-    )
+    width, height = (pixels(path, values, key) for key in ("width", "height"))
+    fx, fy = (number(path, values, key, positive=True) for key in ("fx", "fy"))
+    cx, cy = (number(path, values, key) for key in ("cx", "cy"))
+    baseline, above = number(path, values, "baseline_m", positive=True), None
+    if three_cameras:
+        above = number(path, values, "vertical_baseline_m", positive=True)
+    return CameraRig(width, height, fx, fy, cx, cy, baseline, above, bTc)
 
 
 def _require_perspective(path: Path, view: Any) -> None:
@@ -190,9 +180,8 @@ def as_calibrated(
 
 def read_json_object(path: Path) -> Mapping[str, Any]:
     """A JSON file's outermost object. Raises CalibrationError when there is none."""
-    remedy = "give a calibration: this file (docs/datasets/images.md has its keys), or "
-    remedy += "another one by --camera FILE"
-    values = read_json(path, read_text(path, CalibrationError, remedy))
+    remedy = "give a calibration: this file (docs/datasets/images.md has its keys), or another one"
+    values = read_json(path, read_text(path, CalibrationError, f"{remedy} by --camera FILE"))
     if not isinstance(values, dict):
         raise CalibrationError(f"{path} must hold one JSON object with the calibration's keys")
     return values
@@ -235,8 +224,7 @@ def stated_corrections(path: Path, tree: Tree) -> Mapping[str, float] | None:
     values = tree.get(CORRECTIONS)
     if values is not None and not isinstance(values, dict):
         raise CalibrationError(
-            f"{path}: {CORRECTIONS} must be an object with a number for each term; correct or "
-            "remove it"
+            f"{path}: {CORRECTIONS} must be an object with a number for each term; correct it"
         )
     return values
 
@@ -253,8 +241,7 @@ def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) 
     unknown = sorted(set(values) - known)
     if unknown:
         raise CalibrationError(
-            f"{source}: {CORRECTIONS} has {unknown[0]!r}, which is no term; known: "
-            f"{', '.join(names)}"
+            f"{source}: {CORRECTIONS} has {unknown[0]!r}, no term; known: {', '.join(names)}"
         )
     out = np.zeros(len(own))
     out[own] = [number(Path(source), values, name) for name in names]
@@ -301,7 +288,6 @@ def write_corrected(
     if found.any():
         own = image_terms(rig)
         terms = np.array(term_names(rig))[own].tolist()
-        values[CORRECTIONS] = dict(zip(terms, found[own].tolist(), strict=True))
-        sigmas = correction.sigmas[own].tolist()
-        values["correction_sigmas"] = dict(zip(terms, sigmas, strict=True))
+        for key, numbers in ((CORRECTIONS, found), ("correction_sigmas", correction.sigmas)):
+            values[key] = dict(zip(terms, numbers[own].tolist(), strict=True))
     write_text(path, json.dumps(values, indent=2) + "\n")

@@ -138,25 +138,14 @@ def calibrate(
         if own.any():
             errors[v, c] = _rms(away[own])
             kept[v][c] = Corners(seen.ids[own], seen.pixels[own])
+    places = [inverse(pose(so3_exp(turn[:3]), turn[3:])) for turn in values.turns]
     cameras = tuple(
-        replace(
-            camera_of(model, size, numbers, f"cam{c}"),
-            bTc=inverse(pose(so3_exp(turn[:3]), turn[3:])),
-        )
-        for c, (numbers, turn) in enumerate(zip(values.intrinsics, values.turns, strict=True))
+        replace(camera_of(model, size, numbers, f"cam{c}"), bTc=bTc)
+        for c, (numbers, bTc) in enumerate(zip(values.intrinsics, places, strict=True))
     )
-    return BoardCalibration(
-        cameras,
-        values.turns,
-        sigmas.intrinsics,
-        sigmas.turns,
-        values.boards,
-        tuple(map(tuple, numbered)),
-        tuple(map(tuple, kept)),
-        errors,
-        rms,
-        int((~used).sum()),
-    )
+    found = values.turns, sigmas.intrinsics, sigmas.turns, values.boards
+    seen_views = tuple(map(tuple, numbered)), tuple(map(tuple, kept))
+    return BoardCalibration(cameras, *found, *seen_views, errors, rms, int((~used).sum()))
 
 
 # --------------------------------------------------------------------------------------------
@@ -194,15 +183,10 @@ def _sightings(board: Board, views: Sequence[View]) -> _Sightings:
     counts = [len(corners) for _, _, corners in found]
     view, camera = (np.repeat([one[k] for one in found], counts).astype(int) for k in (0, 1))
     ids = np.concatenate([corners.ids for _, _, corners in found])
-    return _Sightings(
-        view,
-        camera,
-        np.repeat(np.arange(len(found)), counts),
-        ids,
-        board.points[ids],
-        np.concatenate([corners.pixels for _, _, corners in found]),
-        tuple((v, c) for v, c, _ in found),
-    )
+    image = np.repeat(np.arange(len(found)), counts)
+    pixels = np.concatenate([corners.pixels for _, _, corners in found])
+    images = tuple((v, c) for v, c, _ in found)
+    return _Sightings(view, camera, image, ids, board.points[ids], pixels, images)
 
 
 def _require_views(seen: _Sightings, used: BoolArray) -> None:
@@ -430,8 +414,7 @@ def _start(
         )  # fmt: skip
         if not len(both):
             raise CalibrationError(
-                f"cameras 0 and {camera} never see the board at the same time; are the images "
-                "paired rightly?"
+                f"cameras 0 and {camera} never see the board at once; are they paired rightly?"
             )
         # Of the poses that single views give, with any numbering, the one nearest to all others.
         apart = np.linalg.norm(both[:, :, None, None] - both, axis=(4, 5)).min(axis=3).sum(axis=2)
@@ -454,10 +437,7 @@ def _start(
 
 
 def first_guess(
-    model: str,
-    points: Sequence[FloatArray],
-    pixels: Sequence[FloatArray],
-    size: tuple[int, int],
+    model: str, points: Sequence[FloatArray], pixels: Sequence[FloatArray], size: tuple[int, int]
 ) -> FloatArray:
     """Intrinsics (p,) of one camera: fx, fy, cx, cy and the model's parameters.
 

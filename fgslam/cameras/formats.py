@@ -12,18 +12,13 @@ from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from fgslam.cameras.calib_json import OF_RECTIFIED, is_own, is_rectified, read_own
-from fgslam.cameras.lenses import (
-    Calibration,
-    RawCamera,
-    StatedView,
-    checked_camera,
-    checked_view,
-)
+from fgslam.cameras.lenses import Calibration, RawCamera, StatedView, checked_camera, checked_view
 from fgslam.cameras.omni import read_ocamcalib
 from fgslam.cameras.trees import (
     BROWN,
@@ -38,6 +33,7 @@ from fgslam.cameras.trees import (
     intrinsic_matrix,
     kind_of,
     lens_named,
+    listed_lenses,
     read_tree,
 )
 from fgslam.core.arrays import FloatArray
@@ -91,11 +87,6 @@ def has_step(tree: Tree) -> bool:
     return _step(_flat(tree)) is not None
 
 
-def is_opencv_one(tree: Tree) -> bool:
-    """Whether it holds one camera."""
-    return any(isinstance(tree.get(key), np.ndarray) for key in _ONE)
-
-
 def _flat(tree: Tree) -> Tree:
     """The same with what two parts ``left`` and ``right`` hold under names with these words."""
     inner = [
@@ -141,8 +132,8 @@ def _read_opencv_one(path: Path, tree: Tree, size: Size | None) -> Calibration:
         model, coefficients = "omni", np.append(part.number("xi"), coefficients)
     elif part.number("fisheye_model", 0.0):
         model = "equidistant"
-    elif stated := part.text("distortion_model") or part.text("model"):
-        model = lens_named(stated) or model
+    else:
+        model = lens_named(_stated_lens(part)) or model
     size = size or _opencv_size(part)
     camera = checked_camera(RawCamera(*size, matrix, coefficients, np.eye(4), path.name, model))
     return Calibration(str(path), "OpenCV calibration", (camera,))
@@ -182,10 +173,13 @@ def read_opencv_pair(path: Path, tree: Tree, size: Size | None) -> Calibration:
         model, parameters = _opencv_lens(part, distortions[k], matrices[k], k)
         matrix, name = part.matrix(matrices[k], 3, 3), f"{path.name}: {matrices[k]}"
         cameras.append(checked_camera(RawCamera(*size, matrix, parameters, bTc, name, model)))
-    stated = part.text("distortion_model") or part.text("model")
-    guessed = "" if stated or any(len(c.distortion) != 4 for c in cameras) else cameras[0].model
+    known = _stated_lens(part) or any(len(c.distortion) != 4 for c in cameras)
     found = Calibration(str(path), "OpenCV stereo calibration", tuple(cameras), True)
-    return replace(found, guessed_lens=guessed)
+    return replace(found, guessed_lens="" if known else cameras[0].model)
+
+
+def _stated_lens(part: Values) -> str:
+    return part.text("distortion_model") or part.text("model")
 
 
 def _opencv_lens(part: Values, distortion: str, matrix: str, k: int) -> tuple[str, FloatArray]:
@@ -194,7 +188,7 @@ def _opencv_lens(part: Values, distortion: str, matrix: str, k: int) -> tuple[st
     if f"xi{k + 1}" in part:
         return "omni", np.append(part.number(f"xi{k + 1}"), coefficients)
     fisheye = matrix.rpartition(" ")[2][0] == "K" and len(coefficients) == 4
-    if stated := part.text("distortion_model") or part.text("model"):
+    if stated := _stated_lens(part):
         return lens_named(stated) or "radtan", coefficients
     return "equidistant" if fisheye else "radtan", coefficients
 
@@ -217,18 +211,12 @@ def _opencv_size(part: Values) -> Size:
 
 
 _COEFFICIENTS = "distortion_coefficients"
-_ROS_NAMES = (
-    *(_COEFFICIENTS, "camera_matrix"),
-    *("rectification_matrix", "projection_matrix"),
-)
+_ROS_NAMES = (*(_COEFFICIENTS, "camera_matrix"), *("rectification_matrix", "projection_matrix"))
 _ROS = Row(
     size=("image_width", "image_height"),
     matrix="camera_matrix",
     kind=("distortion_model",),
-    lenses={
-        "none": ("radtan", (_COEFFICIENTS,)),
-        **{model: (model, (_COEFFICIENTS,)) for model in ("radtan", "equidistant", "fov")},
-    },
+    lenses=listed_lenses(_COEFFICIENTS, "radtan", "equidistant", "fov", none="radtan"),
 )
 
 
@@ -353,19 +341,12 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
     sized = f"S_rect_{keys[0].removeprefix(_P_RECT)}"
     if raw and sized in lines:
         size = lines.size(sized)
-    cameras = tuple(
-        checked_camera(
-            RawCamera(
-                *(size or (0, 0)),
-                left[:, :3],
-                np.zeros(4),
-                BODY_FORWARD_LEFT_UP_FROM_CAMERA @ pose(np.eye(3), np.array([x, 0.0, 0.0])),
-                f"{path.name}: {key}",
-            )
-        )
-        for key, x in zip(keys, (-baseline, 0.0), strict=True)
-    )
-    return Calibration(str(path), "KITTI", cameras, sided=True)
+    cameras = []
+    for key, x in zip(keys, (-baseline, 0.0), strict=True):
+        bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA @ pose(np.eye(3), np.array([x, 0.0, 0.0]))
+        name, shown = f"{path.name}: {key}", size or (0, 0)
+        cameras.append(checked_camera(RawCamera(*shown, left[:, :3], np.zeros(4), bTc, name)))
+    return Calibration(str(path), "KITTI", tuple(cameras), sided=True)
 
 
 def pair_beside(path: Path) -> tuple[int, int] | None:
@@ -423,7 +404,7 @@ def _lines(path: Path) -> Values:
 # Kalibr's camchain, and the files of tools that write it: OpenVINS, MSCKF-VIO, Kimera-VIO
 
 
-_KALIBR = {
+KALIBR = {
     "pinhole-radtan": ("radtan", 0),
     "pinhole-none": ("radtan", 0),
     "pinhole-equidistant": ("equidistant", 0),
@@ -471,23 +452,15 @@ def _read_camchain(path: Path, tree: Tree, _: Size | None) -> Calibration:
 
 
 def _kalibr_camera(part: Values, bTc: FloatArray) -> RawCamera:
-    model, own = _KALIBR[kind_of(part, ("camera_model", "distortion_model"), _KALIBR)]
+    model, own = KALIBR[kind_of(part, ("camera_model", "distortion_model"), KALIBR)]
     intrinsics = part.numbers("intrinsics", own + 4)
     none = part.text("distortion_model", "none") == "none"
     coefficients = np.zeros(0) if none else part.numbers("distortion_coeffs")
     if model == "omni" and not len(coefficients):
         coefficients = np.zeros(4)
-    return checked_camera(
-        RawCamera(
-            *part.size("resolution"),
-            intrinsic_matrix(*intrinsics[own:]),
-            np.concatenate([intrinsics[:own], coefficients]),
-            bTc,
-            part.name,
-            model,
-            str(part.tree.get("rostopic") or ""),
-        )
-    )
+    matrix, lens = intrinsic_matrix(*intrinsics[own:]), np.append(intrinsics[:own], coefficients)
+    named = part.name, model, str(part.tree.get("rostopic") or "")
+    return checked_camera(RawCamera(*part.size("resolution"), matrix, lens, bTc, *named))
 
 
 def _contradiction(part: Values, k: int, parts: list[Values], cameras: list[RawCamera]) -> str:
@@ -515,15 +488,11 @@ def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 # The ASL layout (EuRoC): one sensor.yaml a camera
 
 
-_LISTED = ("distortion_coefficients",)
 _ASL = Row(
     size=("resolution",),
     focal=("intrinsics",),
     kind=("distortion_model",),
-    lenses={
-        "none": ("radtan", ()),
-        **{model: (model, _LISTED) for model in ("radtan", "equidistant", "fov")},
-    },
+    lenses=listed_lenses(_COEFFICIENTS, "radtan", "equidistant", "fov") | {"none": ("radtan", ())},
 )
 
 
@@ -608,16 +577,12 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
         turns = part.matrix("LEFT.R", 3, 3), part.matrix("RIGHT.R", 3, 3)
         view = checked_view(StatedView(turns, projection[:, :3], size), str(path))
         places = projection[0, 3] / projection[0, 0], 0.0
-        cameras = [
-            camera_of(
-                part,
-                Row(("size",), {"": ("radtan", (f"{side}.D",))}, matrix=f"{side}.K"),
-                pose(turn, np.array([x, 0.0, 0.0])),
-                f"{path.name}: {side}.K",
-            )
-            for side, turn, x in zip(("LEFT", "RIGHT"), turns, places, strict=True)
-        ]
-        return Calibration(str(path), "ORB-SLAM settings", tuple(cameras), True, view, notes)
+        pair = []
+        for side, turn, x in zip(("LEFT", "RIGHT"), turns, places, strict=True):
+            row = Row(("size",), {"": ("radtan", (f"{side}.D",))}, matrix=f"{side}.K")
+            place = pose(turn, np.array([x, 0.0, 0.0]))
+            pair.append(camera_of(part, row, place, f"{path.name}: {side}.K"))
+        return Calibration(str(path), "ORB-SLAM settings", tuple(pair), True, view, notes)
 
     def camera(prefix: str, bTc: FloatArray) -> RawCamera:
         terms = KANNALA if model == "equidistant" else BROWN
@@ -763,7 +728,7 @@ _OAK = Row(
     size=("width", "height"),
     matrix="intrinsicMatrix",
     kind=("cameraType",),  # CameraModel of DepthAI
-    lenses={"0": ("radtan", ("distortionCoeff",)), "1": ("equidistant", ("distortionCoeff",))},
+    lenses=listed_lenses("distortionCoeff", **{"0": "radtan", "1": "equidistant"}),
 )
 
 
@@ -910,12 +875,6 @@ def _is_ocamcalib(text: str) -> bool:
     return first[0].isdecimal() and first[0].lstrip("0") == str(len(first) - 1)
 
 
-def _read_ocamcalib(path: Path, *_: object) -> Calibration:
-    """One camera, forward along its axis."""
-    camera = replace(read_ocamcalib(path)[0], name=path.name)
-    return Calibration(str(path), "OCamCalib", (camera,))
-
-
 # --------------------------------------------------------------------------------------------
 # COLMAP: cameras.txt, and rigs.txt next to it
 
@@ -993,7 +952,7 @@ KNOWN = (
 Reader = Callable[[Path, Tree, Size | None], Calibration]
 
 
-def _one(form: str, camera: Callable[[Path, Tree], RawCamera]) -> Reader:
+def _one(form: str, camera: Callable[[Path, Any], RawCamera]) -> Callable[..., Calibration]:
     """The reader of a format of one camera."""
     return lambda path, tree, _: Calibration(str(path), form, (camera(path, tree),))
 
@@ -1011,7 +970,7 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (is_orb_slam, _read_orb_slam),
     (lambda tree: bool(rgbd_part(tree)), _one("camera of colour and depth", _rgbd)),
     (is_opencv_pair, read_opencv_pair),
-    (is_opencv_one, _read_opencv_one),
+    (lambda tree: any(isinstance(tree.get(key), np.ndarray) for key in _ONE), _read_opencv_one),
 )
 """What recognises a format by its keys, and reads it; the first that fits counts."""
 
@@ -1023,7 +982,10 @@ _TEXTS: tuple[
         lambda path, _, size: read_kitti(path, size),
     ),
     (lambda text: "[LEFT_CAM_" in text and "[STEREO]" in text, _read_zed),
-    (_is_ocamcalib, _read_ocamcalib),
+    (
+        _is_ocamcalib,  # forward along its axis
+        _one("OCamCalib", lambda path, _: replace(read_ocamcalib(path)[0], name=path.name)),
+    ),
     (lambda text: _COLMAP_LINE.search(text) is not None, _read_colmap),
 )
 """The same of files that are no keys and values."""

@@ -396,8 +396,7 @@ class RawCamera:
         if abs(x / y - 1.0) > 0.01:  # a size rounded to whole pixels; cropping changes more
             raise CalibrationError(
                 f"{self.name}: {self.width}x{self.height} pixels cannot be scaled to "
-                f"{size[0]}x{size[1]}, which has another shape; the images were cropped, calibrate "
-                "them"
+                f"{size[0]}x{size[1]}, another shape; they were cropped, calibrate them"
             )
         # Whole pixels are at their centres: the image reaches from -0.5.
         to_new = np.array([[x, 0.0, 0.5 * x - 0.5], [0.0, y, 0.5 * y - 0.5], [0.0, 0.0, 1.0]])

@@ -193,21 +193,20 @@ class Equirectangular:
                 f"{self.top_elevation:g} rad; they must rise, within a quarter turn of the horizon"
             )
 
+    @property
     def _per_row(self) -> float:
         return (self.top_elevation - self.bottom_elevation) / (self.height - 1)
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) unit rays; see :class:`OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
-        bearing = _bearing(pixels[:, 0], self.width)
-        elevation = self.top_elevation - pixels[:, 1] * self._per_row()
-        return unit_rays(bearing, elevation)
+        elevation = self.top_elevation - pixels[:, 1] * self._per_row
+        return unit_rays(_bearing(pixels[:, 0], self.width), elevation)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels; see :class:`OmniCamera`."""
         rays = np.asarray(rays, dtype=np.float64)
-        elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
-        rows = (self.top_elevation - elevation) / self._per_row()
+        rows = (self.top_elevation - angles_of(rays)[1]) / self._per_row
         return inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
 
 
@@ -229,8 +228,7 @@ class Cylinder:
         require_size("cylinder", self.width, self.height)
         if not -np.inf < self.tan_bottom < self.tan_top < np.inf:
             raise CalibrationError(
-                f"cylinder: tangents of elevation from {self.tan_bottom:g} to {self.tan_top:g}; "
-                "they must rise"
+                f"cylinder: tangents from {self.tan_bottom:g} to {self.tan_top:g} must rise"
             )
 
     def tangents(self, rows: FloatArray) -> FloatArray:
@@ -360,9 +358,7 @@ class RadialCamera(ABC):
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels; see :class:`OmniCamera`."""
-        rays = np.asarray(rays, dtype=np.float64)
-        elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
-        bearing = np.arctan2(rays[:, 1], rays[:, 0])
+        bearing, elevation = angles_of(np.asarray(rays, dtype=np.float64))
         radius = self._within(self.radius(elevation))
         return inside(self.frame.pixels(radius, bearing), self.width, self.height)
 
@@ -492,7 +488,8 @@ class RadialPolynomial(RadialCamera):
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""
-        return np.asarray(polynomial.polyval(self._scaled(radius), np.array(self.coefficients)))
+        x = _scaled(radius, self.inner_radius, self.outer_radius)
+        return np.asarray(polynomial.polyval(x, np.array(self.coefficients)))
 
     def radius(self, elevation: FloatArray) -> FloatArray:
         """(n,) radii, from the table by Newton's method; see :class:`RadialCamera`."""
@@ -505,13 +502,11 @@ class RadialPolynomial(RadialCamera):
             x = np.clip(x - (value - wanted) / slope, self.inner_radius, self.outer_radius)
         return np.where(seen, x, np.nan)
 
-    def _scaled(self, radius: FloatArray) -> FloatArray:
-        return _scaled(radius, self.inner_radius, self.outer_radius)
-
     def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
         slope = polynomial.polyder(np.array(self.coefficients))
         per_pixel = 2.0 / (self.outer_radius - self.inner_radius)
-        slopes = per_pixel * polynomial.polyval(self._scaled(radius), slope)
+        x = _scaled(radius, self.inner_radius, self.outer_radius)
+        slopes = per_pixel * polynomial.polyval(x, slope)
         return self.elevation(radius), np.asarray(slopes)
 
 
@@ -543,8 +538,7 @@ def fit_radial_polynomial(
     different = len(np.unique(radius))
     if different <= degree:
         raise CalibrationError(
-            f"radial polynomial: {different} different radii cannot fix degree {degree}; give at "
-            f"least {degree + 1}"
+            f"radial polynomial: {different} different radii cannot fix degree {degree}; give more"
         )
     x = _scaled(radius, *radii)
     coefficients = polynomial.polyfit(x, elevation, degree)
@@ -599,8 +593,7 @@ class LensCamera:
             )
         if not 0.0 <= self.ring[0] < self.ring[1] < np.inf:
             raise CalibrationError(
-                f"camera: ring_px is {self.ring[0]:g} to {self.ring[1]:g}; radii must rise from 0 "
-                "or more"
+                f"camera: ring_px is {self.ring[0]:g} to {self.ring[1]:g}; it must rise from 0"
             )
         matrix = np.array(self.matrix).reshape(3, 3)
         distortion = np.array(self.distortion)
@@ -613,8 +606,7 @@ class LensCamera:
             if not (steps > 0.0).all():
                 raise CalibrationError(
                     f"camera: elevation turns back near radius {radii[np.argmin(steps > 0.0)]:.1f} "
-                    f"px of the ring {self.ring[0]:.1f} to {self.ring[1]:.1f} px; narrow the ring "
-                    "to what the mirror shows"
+                    f"px of the ring {self.ring[0]:.1f} to {self.ring[1]:.1f} px; narrow it"
                 )
 
     @classmethod
@@ -641,8 +633,8 @@ class LensCamera:
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) unit rays; see :class:`OmniCamera`."""
         seen = self._raw.unproject(self._within(np.asarray(pixels, np.float64)))
-        angle = np.arctan2(seen[:, 1], seen[:, 0]) - self.ahead
-        height = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
+        angle, height = angles_of(seen)
+        angle = angle - self.ahead
         return unit_rays(angle if self.clockwise else -angle, height if self.up else -height)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
@@ -674,9 +666,7 @@ _MAX_TERMS = 64
 _MAX_DISAGREEMENT_PX = 3.0
 
 
-def read_ocamcalib(
-    path: Path,
-) -> tuple[RawCamera, tuple[float, float] | None, tuple[int, int]]:
+def read_ocamcalib(path: Path) -> tuple[RawCamera, tuple[float, float] | None, tuple[int, int]]:
     """Of a ``calib_results.txt`` the camera, its ring, and the columns cropped left and right.
 
     The ring is the inner and outer radius that the mirror shows, pixels; None where not stated.
@@ -698,8 +688,7 @@ def read_ocamcalib(
     if len(entries) < 5:
         raise CalibrationError(
             f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "
-            "centre, affine parameters, size): it is truncated or another kind of file; export it "
-            "again"
+            "centre, affine parameters, size): export it again"
         )
     polynomials = []
     for which, (where, _, words) in zip(("direct", "inverse"), entries[:2], strict=True):
@@ -725,8 +714,7 @@ def read_ocamcalib(
             outer, inner = _numbers(f"{where}: ring (largest, smallest radius)", words, 2)
             if not 0.0 <= inner < outer:
                 raise CalibrationError(
-                    f"{where}: ring: largest radius {outer:g} and smallest {inner:g}; the first "
-                    "must be larger"
+                    f"{where}: ring: largest radius {outer:g}, smallest {inner:g}; correct them"
                 )
             ring = inner, outer
         elif "crop" in comment.lower():

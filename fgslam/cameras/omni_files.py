@@ -45,8 +45,7 @@ Size = tuple[int, int]
 
 
 def load_camera(
-    source: str | Path | Mapping[str, Any] | OmniCameraKind,
-    size: tuple[int, int] | None = None,
+    source: str | Path | Mapping[str, Any] | OmniCameraKind, size: tuple[int, int] | None = None
 ) -> OmniCamera:
     """An omnidirectional camera from a calibration file, or from the keys of its model.
 
@@ -105,16 +104,12 @@ def make_camera(
             pictures have another size than was calibrated.
     """
     match settings:
-        case EquirectangularSettings():
-            limits = np.deg2rad([settings.top_elevation_deg, settings.bottom_elevation_deg])
+        case EquirectangularSettings() | CylinderSettings():
+            top, bottom = np.deg2rad([settings.top_elevation_deg, settings.bottom_elevation_deg])
             size = _stated_size(settings.kind, None, image_size)
-            return Equirectangular(*size, float(limits[0]), float(limits[1]))
-        case CylinderSettings():
-            tangents = np.tan(
-                np.deg2rad([settings.bottom_elevation_deg, settings.top_elevation_deg])
-            )
-            size = _stated_size(settings.kind, None, image_size)
-            return Cylinder(*size, float(tangents[0]), float(tangents[1]))
+            if isinstance(settings, EquirectangularSettings):
+                return Equirectangular(*size, float(top), float(bottom))
+            return Cylinder(*size, float(np.tan(bottom)), float(np.tan(top)))
         case HyperbolicMirrorSettings():
             return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
         case OCamCalibSettings():
@@ -252,10 +247,7 @@ def _find(file: str, folder: Path | None) -> Path:
         return local
     if not Path(file).is_file():
         also = "" if local is None else f", nor {local}"
-        raise CalibrationError(
-            f"camera.file: there is no calibration {file}{also}; put it next to the pictures, or "
-            "give its path"
-        )
+        raise CalibrationError(f"camera.file: there is no calibration {file}{also}; give its path")
     return Path(file)
 
 
@@ -268,13 +260,8 @@ _LEVIN = (-0.0028, 0.8184, 0.1850)
 _BLOGGIE_VIEW_DEG, _ABOVE_HORIZON = 60.0, 0.8
 """Vertical field of view, and its part above the horizon: assumed, no calibration is published."""
 _BLOGGIE_KEYS = (
-    "INPUT_WIDTH",
-    "INPUT_HEIGHT",
-    "OPTICAL_CENTER_X",
-    "OPTICAL_CENTER_Y",
-    "MAX_R_PERCENT",
-    "MIN_R_PERCENT",
-    "ANGLE_SHIFT",
+    *("INPUT_WIDTH", "INPUT_HEIGHT", "OPTICAL_CENTER_X", "OPTICAL_CENTER_Y"),
+    *("MAX_R_PERCENT", "MIN_R_PERCENT", "ANGLE_SHIFT"),
 )
 
 
@@ -289,12 +276,9 @@ def _bloggie(path: Path, size: Size | None) -> RadialPolynomial:
             f"{size[0]}x{size[1]}; give their own settings"
         )
     # Half a pixel: that tool counts from the corner, here the first pixel's centre is 0.
-    centre = (
-        width * values["OPTICAL_CENTER_X"] - 0.5,
-        height * values["OPTICAL_CENTER_Y"] - 0.5,
-    )
-    inner = 0.5 * height * values["MIN_R_PERCENT"]
-    outer = 0.5 * height * values["MAX_R_PERCENT"]
+    column, row = (values[f"OPTICAL_CENTER_{axis}"] for axis in "XY")
+    centre = width * column - 0.5, height * row - 0.5
+    inner, outer = (0.5 * height * values[f"{end}_R_PERCENT"] for end in ("MIN", "MAX"))
     frame = MirrorFrame(*size, centre, math.radians(values["ANGLE_SHIFT"] - 180.0))
     down = np.linspace(0.0, 1.0, 50)
     fraction = np.clip(np.polynomial.polynomial.polyval(down, np.array(_LEVIN)), 0.0, 1.0)

@@ -209,7 +209,9 @@ def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatAr
     for number, (columns, rows) in enumerate(sides):
         raw_axis, far = divmod(number, 2)
         axis = of_columns if raw_axis == 0 else 1 - of_columns
-        found = _on_plane(camera, rotation, np.column_stack([columns, rows]))[:, axis]
+        rays = camera.unproject(np.column_stack([columns, rows])) @ rotation.T
+        rays = rays[rays[:, 2] > 0.0]  # NaN is not
+        found = rays[:, axis] / rays[:, 2]
         if not len(found):
             continue
         if (rotation[axis, raw_axis] > 0.0) == bool(far):
@@ -217,13 +219,6 @@ def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatAr
         else:
             low[axis] = max(low[axis], found.max())
     return low, high
-
-
-def _on_plane(camera: RawCamera, rotation: FloatArray, pixels: FloatArray) -> FloatArray:
-    """(k, 2) where rays of pixels meet the plane at z = 1, of those that do."""
-    rays = camera.unproject(pixels) @ rotation.T
-    rays = rays[rays[:, 2] > 0.0]  # NaN is not
-    return np.asarray(rays[:, :2] / rays[:, 2:])
 
 
 def pixel_grid(size: tuple[int, int]) -> FloatArray:
@@ -262,17 +257,10 @@ def rectifier(
     # The axes of the view in the body, by the reference camera.
     axes = right.bTc[:3, :3] @ rotations[0].T
     away = [axes.T @ (right.bTc[:3, 3] - camera.bTc[:3, 3]) for camera in cameras[1:]]
-    rig = CameraRig(
-        width=view.size[0],
-        height=view.size[1],
-        fx=float(focal[0]),
-        fy=float(focal[1]),
-        cx=float(view.matrix[0, 2]),
-        cy=float(view.matrix[1, 2]),
-        baseline=float(away[0][0]),
-        vertical_baseline=float(away[1][1]) if len(away) > 1 else None,
-        bTc=pose(axes, right.bTc[:3, 3]),
-    )
+    above = float(away[1][1]) if len(away) > 1 else None
+    fx, fy, cx, cy = (float(value) for value in (*focal, *view.matrix[:2, 2]))
+    bTc = pose(axes, right.bTc[:3, 3])
+    rig = CameraRig(*view.size, fx, fy, cx, cy, float(away[0][0]), above, bTc)
     correction = None if corrected is None else corrected(rig)
     maps = tuple(
         sampling_maps(camera, rotation, view, displaced_grid(rig, k, correction))

@@ -122,8 +122,7 @@ def require_rig(rig: CameraRig) -> None:
     """Raises CalibrationError where ``rig`` is none, or its numbers cannot be those of one."""
     if not isinstance(rig, CameraRig):
         raise CalibrationError(
-            f"rig: it is a {type(rig).__name__}; give a fgslam.StereoRig, or load one by "
-            "fgslam.StereoRig.load(file)"
+            f"rig: it is a {type(rig).__name__}; give fgslam.StereoRig.load(file)"
         )
     if fault := rig_fault(rig):
         raise CalibrationError(f"rig: {fault}")
@@ -252,8 +251,7 @@ def with_masks(rig: StereoRig, path: Path) -> StereoRig:
         if mask is None or mask.shape != (height, width):
             found = "no picture" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
             raise CalibrationError(
-                f"{file}: is {found}, but a mask has the size of the images, {width}x{height}; "
-                "black is hidden"
+                f"{file}: is {found}, but a mask has the size of the images, {width}x{height}"
             )
         shown.append(np.where(mask > _WHITE, 255, 0).astype(np.uint8))
     if all(one is None for one in shown):
@@ -611,8 +609,7 @@ def _require_rig_cameras(calibration: Calibration) -> None:
         )
     if len(cameras) > 3:
         raise CalibrationError(
-            f"{calibration.source}: holds {len(cameras)} cameras; say which two or three form the "
-            "rig: cameras=(0, 1)"
+            f"{calibration.source}: {len(cameras)} cameras; say which form the rig: cameras=(0, 1)"
         )
     if any(camera.width == 0 for camera in cameras):
         raise CalibrationError(

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni import (
-    PAPER_DEGREE,
-    MirrorFrame,
-    RadialPolynomial,
-    fit_radial_polynomial,
-)
+from fgslam.cameras.omni import PAPER_DEGREE, MirrorFrame, RadialPolynomial, fit_radial_polynomial
 from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 
@@ -47,9 +42,7 @@ class MirrorCircle:
 
 
 def find_mirror_circle(
-    image: Image,
-    rng: np.random.Generator,
-    near: tuple[tuple[float, float], float] | None = None,
+    image: Image, rng: np.random.Generator, near: tuple[tuple[float, float], float] | None = None
 ) -> MirrorCircle:
     """Finds the circle on which the mirror's bright picture ends toward the dark around it.
 
@@ -125,10 +118,7 @@ def _peaks(slopes: FloatArray | Float32, least: float) -> tuple[FloatArray, Floa
 
 
 def _falling_edges(
-    grey: Float32,
-    centre: tuple[float, float],
-    limits: tuple[float, float],
-    outermost: bool = True,
+    grey: Float32, centre: tuple[float, float], limits: tuple[float, float], outermost: bool = True
 ) -> FloatArray:
     """(n, 2) points at which the picture gets darker outward.
 

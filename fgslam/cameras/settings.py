@@ -14,6 +14,9 @@ from pydantic.dataclasses import dataclass
 from fgslam.core.settings import STRICT, Positive
 
 Pair: TypeAlias = tuple[float, float]
+Elevation: TypeAlias = Annotated[float, Field(ge=-90.0, le=90.0)]
+Below90: TypeAlias = Annotated[float, Field(gt=-90.0, lt=90.0)]
+File: TypeAlias = Annotated[str, Field(min_length=1)]
 Size: TypeAlias = tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
 
 
@@ -22,12 +25,8 @@ class EquirectangularSettings:
     """A panorama; its size is that of the pictures."""
 
     kind: Literal["equirectangular"] = "equirectangular"
-    top_elevation_deg: float = Field(
-        default=90.0, ge=-90.0, le=90.0, description="of the first row, degrees up"
-    )
-    bottom_elevation_deg: float = Field(
-        default=-90.0, ge=-90.0, le=90.0, description="of the last row, degrees up"
-    )
+    top_elevation_deg: Elevation = Field(default=90.0, description="of the first row")
+    bottom_elevation_deg: Elevation = Field(default=-90.0, description="of the last row")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -35,12 +34,8 @@ class CylinderSettings:
     """A panorama whose rows are proportional to the tangent of elevation."""
 
     kind: Literal["cylinder"] = "cylinder"
-    top_elevation_deg: float = Field(
-        default=45.0, gt=-90.0, lt=90.0, description="of the first row, degrees up"
-    )
-    bottom_elevation_deg: float = Field(
-        default=-45.0, gt=-90.0, lt=90.0, description="of the last row, degrees up"
-    )
+    top_elevation_deg: Below90 = Field(default=45.0, description="of the first row")
+    bottom_elevation_deg: Below90 = Field(default=-45.0, description="of the last row")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -51,17 +46,14 @@ class MirrorMountSettings:
         default=-90.0,
         ge=-360.0,
         le=360.0,
-        description="direction of the robot's heading in the picture, clockwise from the right;"
-        " -90 is up",
+        description="the robot's heading in the picture, clockwise from the right",
     )
     clockwise: bool = Field(
-        default=True,
-        description="bearings grow clockwise, as in an upward-looking camera's raw picture",
+        default=True, description="bearings grow clockwise, as in a picture from below"
     )
     ring_px: Pair | None = Field(
         default=None,
-        description="inner and outer radius of what shows the surroundings; null: as the file "
-        "states, or by the elevations at the rims, else the largest circle in the picture",
+        description="radii of what is shown; null: as stated, by elevations, or the largest circle",
     )
 
 
@@ -69,12 +61,8 @@ class MirrorMountSettings:
 class PlacedMirrorSettings(MirrorMountSettings):
     """A mirror whose place in the picture no file states."""
 
-    size: Size | None = Field(
-        default=None, description="width, height calibrated, pixels; null: any picture's"
-    )
-    centre: Pair | None = Field(
-        default=None, description="column, row of the mirror's axis; null: the middle"
-    )
+    size: Size | None = Field(default=None, description="width, height in pixels; null: any")
+    centre: Pair | None = Field(default=None, description="column, row; null: the middle")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -82,21 +70,15 @@ class HyperbolicMirrorSettings(PlacedMirrorSettings):
     """A hyperbolic mirror as a unified sphere."""
 
     kind: Literal["mirror"] = "mirror"
-    xi: float = Field(
-        default=0.92, gt=0.0, le=1.0, description="2 e / (1 + e^2), e the mirror's eccentricity"
-    )
+    xi: float = Field(default=0.92, gt=0.0, le=1.0, description="2 e / (1 + e^2) of eccentricity e")
     focal_px: Positive | None = Field(
-        default=None,
-        description="of the unified model: the horizon's radius times xi; null: by the outer rim",
+        default=None, description="the horizon's radius times xi; null: by the outer rim"
     )
     inner_elevation_deg: float = Field(
-        default=-65.0, ge=-90.0, lt=90.0, description="at the inner rim, where ring_px is null"
+        default=-65.0, ge=-90.0, lt=90.0, description="at the inner rim without ring_px"
     )
-    outer_elevation_deg: float = Field(
-        default=25.0,
-        gt=-90.0,
-        lt=90.0,
-        description="at the outer rim, where ring_px or focal_px is null",
+    outer_elevation_deg: Below90 = Field(
+        default=25.0, description="at the outer rim without ring_px or focal_px"
     )
 
 
@@ -105,11 +87,7 @@ class OCamCalibSettings(MirrorMountSettings):
     """A camera calibrated with OCamCalib."""
 
     kind: Literal["ocamcalib"] = "ocamcalib"
-    file: str = Field(
-        default="calib_results.txt",
-        min_length=1,
-        description="calib_results.txt, looked for next to the pictures, then from here",
-    )
+    file: File = Field(default="calib_results.txt", description="next to the pictures, else here")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -117,15 +95,9 @@ class LensSettings(MirrorMountSettings):
     """A camera of camodocal (MEI, KANNALA_BRANDT) or of Kalibr whose axis is vertical."""
 
     kind: Literal["lens"] = "lens"
-    file: str = Field(
-        default="camera.yaml",
-        min_length=1,
-        description="its calibration, looked for next to the pictures, then here",
-    )
+    file: File = Field(default="camera.yaml", description="next to the pictures, else here")
     middle: Literal["down", "up"] = Field(
-        default="down",
-        description="where the picture's middle points: down as of a mirror above the camera, "
-        "up as of a fisheye that points up",
+        default="down", description="where its middle points: up as of a fisheye that points up"
     )
 
 
@@ -139,7 +111,7 @@ class RadialPolynomialSettings(PlacedMirrorSettings):
         default=(-20.0, 45.0),
         min_length=2,
         max_length=12,
-        description="elevation over the radius scaled to [-1, 1], from the constant upward",
+        description="elevation over the radius in [-1, 1], from the constant up",
     )
 
 
@@ -152,11 +124,7 @@ class BloggieSettings:
     """
 
     kind: Literal["bloggie"] = "bloggie"
-    file: str = Field(
-        default="bloggie_settings.txt",
-        min_length=1,
-        description="settings.txt, looked for next to the video, then from here",
-    )
+    file: File = Field(default="bloggie_settings.txt", description="next to the video, else here")
 
 
 OmniCameraKind: TypeAlias = (

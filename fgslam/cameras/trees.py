@@ -53,27 +53,24 @@ class Row(NamedTuple):
     matrix: str = ""
 
 
-_LENSES = {"": "radtan"} | {
-    name: model
-    for model, names in (
-        (
-            "radtan",
-            "radtan radialtangential plumbbob brown brownconrady modifiedbrownconrady rational "
-            "rationalpolynomial radtan8 thinprism opencv fullopencv pinhole perspective 1 4",
-        ),
-        (
-            "equidistant",
-            "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 "
-            "kb kb4 kb8 5",
-        ),
-        ("fov", "fov atan"),
-        ("omni", "omni omnidirectional mei"),
-        ("ds", "ds doublesphere"),
-        ("eucm", "eucm"),
-    )
-    for name in names.split()
+_NAMES = {
+    "radtan": "radtan radialtangential plumbbob brown brownconrady modifiedbrownconrady rational "
+    "rationalpolynomial radtan8 thinprism opencv fullopencv pinhole perspective 1 4",
+    "equidistant": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 "
+    "kannalabrandt8 kb kb4 kb8 5",
+    "fov": "fov atan",
+    "omni": "omni omnidirectional mei",
+    "ds": "ds doublesphere",
+    "eucm": "eucm",
 }
+_LENSES = {"": "radtan"} | {name: lens for lens, names in _NAMES.items() for name in names.split()}
 """Our model by what tools call it (of RealSense also its numbers), in small letters alone."""
+
+
+def listed_lenses(key: str, *models: str, **named: str) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Lenses of a row whose parameters are all under one key; ``named``: our models by texts."""
+    known = {model: model for model in models} | named
+    return {text: (model, (key,)) for text, model in known.items()}
 
 
 def lens_named(text: str) -> str:

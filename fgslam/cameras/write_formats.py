@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.calib_json import raw_values
+from fgslam.cameras.formats import KALIBR
 from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
 from fgslam.cameras.rig import rig_of
 from fgslam.cameras.trees import intrinsic_matrix
@@ -52,52 +53,28 @@ def write_calibration(
         )
     if name not in FORMATS:
         raise CalibrationError(f"format {name!r} is not known; use {', '.join(FORMATS)}")
-    words, endings = FORMATS[name]
+    words, endings, write = FORMATS[name]
     if path.suffix.lower() not in endings:
         wanted = " or ".join(ending or "no ending, a folder" for ending in endings)
         raise CalibrationError(f"{path}: {words} is written as {wanted}; give such a name")
     if name != "fgslam":
         calibration.require_uncorrected(f"{words} cannot hold them")
-    match name:
-        case "fgslam":
-            write_text(path, json.dumps(raw_values(calibration), indent=2) + "\n")
-        case "opencv":
-            _write_opencv(calibration, path)
-        case "kalibr":
-            _write_kalibr(calibration, path)
-        case "ros":
-            _write_ros(calibration, path, fov_deg)
+    write(calibration, path, fov_deg)
     return words
 
 
-FORMATS = {
-    "fgslam": ("calib.json of fgslam", (".json",)),
-    "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json")),
-    "kalibr": ("Kalibr", (".yaml", ".yml")),
-    "ros": ("ROS camera_info, a folder", ("",)),
-}
-"""Formats that are written: in words, and the endings of their names."""
-_ENDINGS = {
-    ".json": "fgslam",
-    ".yml": "opencv",
-    ".xml": "opencv",
-    ".yaml": "kalibr",
-    "": "ros",
-}
+_ENDINGS = {".json": "fgslam", ".yml": "opencv", ".xml": "opencv", ".yaml": "kalibr", "": "ros"}
 
 
-_KALIBR = {
-    "radtan": ("pinhole", "radtan", 0),
-    "equidistant": ("pinhole", "equidistant", 0),
-    "fov": ("pinhole", "fov", 0),
-    "omni": ("omni", "radtan", 1),
-    "ds": ("ds", "none", 2),
-    "eucm": ("eucm", "none", 2),
-}
+def _write_own(calibration: Calibration, path: Path, _: float | None) -> None:
+    write_text(path, json.dumps(raw_values(calibration), indent=2) + "\n")
+
+
+_KALIBR = {model: (*names.split("-"), own) for names, (model, own) in reversed(KALIBR.items())}
 """Its camera and distortion model, and how many of our parameters are among its intrinsics."""
 
 
-def _write_kalibr(calibration: Calibration, path: Path) -> None:
+def _write_kalibr(calibration: Calibration, path: Path, _: float | None) -> None:
     chain: dict[str, dict[str, Any]] = {}
     for k, camera in enumerate(calibration.cameras):
         if camera.model not in _KALIBR:
@@ -106,8 +83,7 @@ def _write_kalibr(calibration: Calibration, path: Path) -> None:
         numbers = _shortened(camera, 4, "Kalibr") if camera.model == "radtan" else camera.distortion
         if camera.matrix[0, 1] or camera.matrix[1, 0]:
             raise CalibrationError(
-                f"{camera.name}: its pixels are skew, which Kalibr has no number for; write "
-                "calib.json"
+                f"{camera.name}: its pixels are skew, which Kalibr cannot hold; write calib.json"
             )
         chain[f"cam{k}"] = {
             "camera_model": model,
@@ -127,7 +103,7 @@ _OPENCV = {"radtan": "M", "equidistant": "K", "omni": "K"}
 """Letter of the matrices: cv2.fisheye's and cv2.omnidir's are K."""
 
 
-def _write_opencv(calibration: Calibration, path: Path) -> None:
+def _write_opencv(calibration: Calibration, path: Path, _: float | None) -> None:
     first, second = _pair(calibration, "OpenCV's file")
     if first.size != second.size:
         sizes = " and ".join(f"{width}x{height}" for width, height in (first.size, second.size))
@@ -172,14 +148,13 @@ def _write_ros(calibration: Calibration, path: Path, fov_deg: float | None) -> N
     baseline = float(np.linalg.norm(calibration.offset(1, 0)[:3, 3]))
     files = {}
     for k, (camera, name) in enumerate(zip(cameras, ("left", "right"), strict=True)):
-        if camera.model == "equidistant":
-            kind, coefficients = "equidistant", camera.distortion
-        elif camera.model == "radtan":
-            most = 8 if camera.distortion[5:].any() else 5
+        if camera.model not in ("equidistant", "radtan"):
+            raise _refused(camera, "ROS")
+        kind, coefficients = camera.model, camera.distortion
+        if kind == "radtan":
+            most = 8 if coefficients[5:].any() else 5
             kind = "rational_polynomial" if most == 8 else "plumb_bob"
             coefficients = _shortened(camera, most, "ROS")
-        else:
-            raise _refused(camera, "ROS")
         projection = np.column_stack([view.matrix, np.zeros(3)])
         projection[0, 3] = -view.matrix[0, 0] * baseline * k
         files[f"{name}.yaml"] = {
@@ -201,6 +176,15 @@ def _write_ros(calibration: Calibration, path: Path, fov_deg: float | None) -> N
 def _block(key: str, matrix: FloatArray) -> Mapping[str, Any]:
     rows, columns = matrix.shape
     return {key: {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}}
+
+
+FORMATS = {
+    "fgslam": ("calib.json of fgslam", (".json",), _write_own),
+    "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json"), _write_opencv),
+    "kalibr": ("Kalibr", (".yaml", ".yml"), _write_kalibr),
+    "ros": ("ROS camera_info, a folder", ("",), _write_ros),
+}
+"""Formats that are written: in words, the endings of their names, and what writes them."""
 
 
 # --------------------------------------------------------------------------------------------

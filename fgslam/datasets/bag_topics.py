@@ -93,9 +93,8 @@ def choose_topics(
             )
         if by_name[name].kind not in (*IMAGES, *MOTIONS):
             raise DatasetError(
-                f"{settings.path}: {name} is {by_name[name].kind}, which is no image and no "
-                "odometry; name the left camera's images, the right one's, then perhaps one of "
-                "odometry"
+                f"{settings.path}: {name} is {by_name[name].kind}, no image or odometry; "
+                "name the left camera's images, the right one's, then perhaps one of odometry"
             )
     images = [topic.name for topic in used if topic.kind in IMAGES]
     named = [name for name in settings.topics if by_name[name].kind in IMAGES]
@@ -154,9 +153,8 @@ def _as_named(
     if settings.camera_file is None or len(cameras) not in (0, 3):
         file = Path(settings.camera_file or "").name
         raise DatasetError(
-            f"{settings.path}: three topics of images are named, which need one calibration of all "
-            f"three cameras ({f'{file} is of {len(cameras)}' if file else 'none'}); give it by "
-            "--camera FILE, or name two topics"
+            f"{settings.path}: three topics need one calibration of three cameras "
+            f"({f'{file} is of {len(cameras)}' if file else 'none'}); give it by --camera FILE"
         )
     return Chosen(tuple(names), (0, 1, 2))
 

@@ -193,8 +193,7 @@ def paths_of(given: Path) -> list[Path]:
     found = _bag_files(given) if given.is_dir() else files_of(given)
     if packed := next(filter(is_packed_bag, found), None):
         raise DatasetError(
-            f"{packed} is compressed as a whole, and no metadata.yaml is next to it; unpack it: "
-            f"zstd -d {packed.name}"
+            f"{packed} is packed, without a metadata.yaml; unpack it: zstd -d {packed.name}"
         )
     return found
 
@@ -409,8 +408,7 @@ class Bag:
                 self._go_to(place)
             if place not in self._kept:
                 raise FrameError(
-                    f"message {place} in {self.paths[0]} is not where the index names it; copy the "
-                    "bag again"
+                    f"message {place} in {self.paths[0]} is not at its index; copy the bag again"
                 )
             connection, _, raw = self._kept[place]
         where = f"{self.paths[0]}, {connection.topic}"
@@ -445,10 +443,7 @@ class Bag:
 
 
 def _odometry_source(
-    topic: Topic | None,
-    stamps: FloatArray,
-    values: FloatArray,
-    settings: RecordedOdometrySettings,
+    topic: Topic | None, stamps: FloatArray, values: FloatArray, settings: RecordedOdometrySettings
 ) -> OdometrySource | None:
     """Body motions by a topic's stamps (n,) in seconds and values; None where there is none."""
     if topic is None or len(stamps) == 0:
@@ -460,8 +455,7 @@ def _odometry_source(
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(bad):
             raise OdometryError(
-                f"{topic.name}, message {kept[bad[0]] + 1}: not finite; record it again, or choose "
-                "another odometry.kind"
+                f"{topic.name}, message {kept[bad[0]] + 1}: not finite; set another odometry.kind"
             )
         names = {messages.ODOMETRY: POSE_COLUMNS, messages.IMU: RATE_COLUMNS}
         table = Table(Path(topic.name), rows, kept + 1, names.get(topic.kind, SPEED_COLUMNS))
@@ -583,8 +577,7 @@ def _rig_of_depth(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
         topic = chosen.infos[1] or chosen.infos[0]
         if topic is None:
             raise CalibrationError(
-                f"{settings.path}: no camera_info belongs to {chosen.right}; give its calibration "
-                "by --camera FILE"
+                f"{settings.path}: no camera_info of {chosen.right}; give one by --camera FILE"
             )
         values = _info_of(settings, bag, topic, _is_rectified(chosen.right))
         read = read_camera_info(Path(f"{settings.path}:{topic}"), values)
@@ -639,8 +632,8 @@ def _rig_by_tree(
         apart = inverse(fTc) @ bag.tree.pose(left, right) @ fTc
     except CalibrationError as fault:
         raise CalibrationError(
-            f"{source}: projection_matrix states no baseline, and {fault}; "
-            "give the calibration of both by --camera FILE"
+            f"{source}: projection_matrix has no baseline, and {fault}; give the "
+            "calibration of both by --camera FILE"
         ) from None
     cameras = tuple(
         replace(read_camera_info(file, info).cameras[0], name=str(topic), bTc=place)

@@ -160,8 +160,7 @@ def judged(seen: SeenTurns) -> Judged:
         if _DEGREES / _LIKE_DEGREES < scale < _DEGREES * _LIKE_DEGREES:
             raise OdometryError(
                 f"the odometry of {seen.name} turns {scale:.0f} times as fast as the images: its "
-                "angular velocity is in degrees/s, radians/s are expected; name the columns so "
-                "(gyro_x_dps), or convert them"
+                "angular velocity is in degrees/s, not radians/s; name the columns so (gyro_x_dps)"
             )
     if size > _CLEAR_TURN_RAD and left > _AGREES * size and seen.by_gyroscope:
         return Judged(

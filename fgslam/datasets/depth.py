@@ -21,7 +21,7 @@ from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import View, pixel_grid, sampling_maps
 from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
 from fgslam.cameras.trees import intrinsic_matrix, read_tree
-from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_lines, shown_in
@@ -34,6 +34,7 @@ from fgslam.datasets.images import (
     read_colour_image,
     read_depth_image,
     require_size,
+    spread_over,
 )
 from fgslam.datasets.layouts import (
     CameraFiles,
@@ -43,11 +44,7 @@ from fgslam.datasets.layouts import (
     images_in,
 )
 from fgslam.datasets.ledger import DEPTH, LENS, PAIRING, TIMES, Entry
-from fgslam.datasets.recording import (
-    Recording,
-    folder_recording,
-    mounted,
-)
+from fgslam.datasets.recording import Recording, folder_recording, mounted
 from fgslam.datasets.settings import (
     CalibratedSettings,
     DepthSettings,
@@ -59,6 +56,7 @@ from fgslam.datasets.times import (
     Pairs,
     Stamps,
     even_stamps,
+    listed_files,
     pair_files,
     pair_stamps,
     stamps_of,
@@ -228,7 +226,7 @@ def _pairs(root: Path, fps: float | None) -> tuple[Pairs, Stamps]:
     """Colour and depth of each frame, and the times of the colour images."""
     lists = (root / "rgb.txt", root / "depth.txt")
     if all(path.is_file() for path in lists):
-        (colour_at, colours), (depth_at, depths) = map(_listed, lists)
+        (colour_at, colours), (depth_at, depths) = map(listed_files, lists)
         others = [("depth", str(lists[1]), depth_at)]
         rows, notes, pairing = pair_stamps(colour_at, others, str(lists[0]), "colour")
         pairs = tuple((colours[i], depths[j]) for i, j in rows.tolist())
@@ -284,21 +282,6 @@ def _associated(path: Path, fps: float | None) -> tuple[Pairs, Stamps]:
             )
         timed = Stamps(stamps, (), (), Entry(TIMES, "stamps", str(path), "--fps"))
     return (pairs, (), Entry(PAIRING, "as listed", str(path))), timed._replace(lists=(path,))
-
-
-def _listed(path: Path) -> tuple[IntArray, list[Path]]:
-    """Stamps (n,) in nanoseconds and files of a list ``seconds file``."""
-    stamps, files = [], []
-    for number, text in read_lines(path):
-        words = text.split()
-        if len(words) < 2 or re.fullmatch(r"\d+(\.\d+)?", words[0]) is None:
-            raise DatasetError(f"{path}, line {number}: expected seconds and a file; correct it")
-        whole, _, part = words[0].partition(".")
-        stamps.append(int(whole) * 10**9 + int(part[:9].ljust(9, "0") or 0))
-        files.append(path.parent / words[1])
-    if not stamps or np.any(np.diff(stamps) <= 0):
-        raise DatasetError(f"{path}: lists no image, or times do not increase; restore the file")
-    return np.array(stamps, np.int64), files
 
 
 # --------------------------------------------------------------------------------------------
@@ -383,7 +366,7 @@ def sample_depths(
 ) -> tuple[FloatArray, bool]:
     """Known depths (n,) of some images, in their own units, and whether these are integers."""
     images, faults = [], [""]
-    for row in np.unique(np.linspace(0, count - 1, _SAMPLES).astype(int)).tolist():
+    for row in spread_over(count, _SAMPLES):
         try:
             images.append(read(row))
         except FrameError as fault:
@@ -449,7 +432,7 @@ def camera_of_file(
         lambda c: _OF_COLOUR.search(f"{c.name.rpartition(':')[2]} {c.topic}") is not None,
     ):
         left = list(filter(fits, left)) or left
-    if any(not _alike(camera, left[0]) for camera in left):
+    if len({(c.model, *c.matrix.flat, *c.distortion) for c in left}) > 1:
         raise CalibrationError(
             f"{path} holds {len(found.cameras)} cameras, and nothing states which of them took the "
             f"colour images: say it: --set dataset.colour_camera=0 for {found.cameras[0].name}, "
@@ -457,12 +440,6 @@ def camera_of_file(
         )
     alone = replace(found, cameras=(left[0],), view=None)
     return at_size(alone, size, settings.resized).cameras[0]
-
-
-def _alike(a: RawCamera, b: RawCamera) -> bool:
-    return a.model == b.model and all(
-        map(np.array_equal, (a.matrix, a.distortion), (b.matrix, b.distortion))
-    )
 
 
 def _camera(
@@ -477,8 +454,7 @@ def _camera(
     known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
     if known is None or size != (640, 480):
         raise CalibrationError(
-            f"{root}: nothing states the colour camera's focal length; give its calibration by "
-            "--camera FILE"
+            f"{root}: nothing states the colour camera's focal length; give one by --camera FILE"
         )
     intrinsics, distortion = _TUM_CAMERAS[known[1]]
     matrix, name = intrinsic_matrix(*intrinsics), f"freiburg{known[1]}"

@@ -26,7 +26,7 @@ from fgslam.datasets.images import (
     open_frames,
     require_folder,
 )
-from fgslam.datasets.layouts import files_of, find_cameras, images_in, only_images
+from fgslam.datasets.layouts import files_of, find_cameras, images_in
 from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
 from fgslam.datasets.recording import (
     Recording,
@@ -42,12 +42,7 @@ from fgslam.datasets.settings import (
     LooseImagesSettings,
     RecordedOdometrySettings,
 )
-from fgslam.datasets.times import (
-    pair_files,
-    read_table,
-    require_increasing,
-    stamps_of,
-)
+from fgslam.datasets.times import pair_files, read_table, require_increasing, stamps_of
 
 # ------------------------------------------------------------------------------------------
 # Our own layout: left/, right/[, top/], calib.json, times.txt
@@ -154,8 +149,7 @@ def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:
     for folder, images in cameras.items():
         if not images:
             raise DatasetError(
-                f"{folder} holds no image named by its number (000000.png ...): the whole camera "
-                "is missing; restore it"
+                f"{folder} holds no image named by its number (000000.png ...); restore them"
             )
     return cameras
 
@@ -199,8 +193,7 @@ def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
     if len(repeated):
         k = int(repeated[0])
         raise DatasetError(
-            f"{path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; "
-            "remove one of the lines"
+            f"{path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; remove one"
         )
     require_increasing(table, table.values[:, 1])
     return numbers, table.values[:, 1]
@@ -225,7 +218,7 @@ def open_loose_images(
     root, whole, notes = folder, None, tuple[str, ...]()
     paths: Sequence[tuple[Path, ...]]
     if cameras is None:
-        every = tuple(files or images_in(only_images(folder) or folder))
+        every = tuple(files or images_in(folder))
         whole = first_size(every)
         rig, how = _rig_of_views(settings, given, whole)
         paths, pairing = [(path,) for path in every], Entry(PAIRING, "in one image", how)

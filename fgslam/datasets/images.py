@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -165,8 +165,7 @@ def list_numbered_images(folder: Path) -> dict[int, Path]:
         number = int(path.stem)
         if number in numbered:
             raise DatasetError(
-                f"{folder} has two images of frame {number}: {numbered[number].name} and "
-                f"{path.name}; remove one"
+                f"{folder} has two of {number}: {numbered[number].name}, {path.name}; remove one"
             )
         numbered[number] = path
     return numbered
@@ -174,13 +173,27 @@ def list_numbered_images(folder: Path) -> dict[int, Path]:
 
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """Width and height of the first image that can be read; None without any."""
-    for path in paths:
+    image = next(readable(read_grey_image, paths), None)
+    return None if image is None else (image.shape[1], image.shape[0])
+
+
+_P = TypeVar("_P")
+_T = TypeVar("_T")
+
+
+def readable(read: Callable[[_P], _T], places: Iterable[_P]) -> Iterator[_T]:
+    """What is read at those places where nothing is missing or damaged."""
+    for place in places:
         try:
-            height, width = read_grey_image(path).shape
+            found = read(place)
         except FrameError:
             continue
-        return width, height
-    return None
+        yield found
+
+
+def spread_over(count: int, most: int) -> list[int]:
+    """At most so many of the numbers 0 to ``count`` - 1, all over them."""
+    return [int(k) for k in np.unique(np.linspace(0, count - 1, most).astype(int))]
 
 
 def require_folder(path: Path, what: str) -> None:
@@ -356,11 +369,7 @@ def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[in
         stored: the pixels of a frame as they are stored; raises FrameError.
     """
     largest = 0
-    for frame in np.unique(np.linspace(0, count - 1, _SAMPLED_FRAMES).astype(int)).tolist():
-        try:
-            pixels = stored(frame)
-        except FrameError:
-            continue
+    for pixels in readable(stored, spread_over(count, _SAMPLED_FRAMES)):
         if pixels.dtype != np.uint16:
             return 16, ()
         largest = max(largest, int(pixels.max()))
@@ -388,12 +397,9 @@ def mosaic_note(count: int, grey: Callable[[int], Image]) -> tuple[str, ...]:
         count: of frames.
         grey: an image of a frame; raises FrameError.
     """
-    found = []
-    for frame in sorted({0, count // 2, count - 1}):
-        try:
-            found.append(_neighbour_ratio(grey(frame)))
-        except FrameError:
-            continue
+    found = [
+        _neighbour_ratio(image) for image in readable(grey, sorted({0, count // 2, count - 1}))
+    ]
     if not found or np.median(found) < _MOSAIC:
         return ()
     return (

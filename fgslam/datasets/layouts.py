@@ -143,15 +143,11 @@ def _unknown(folder: Path) -> str:
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
 
 
-def only_images(folder: Path) -> Path | None:
-    """The only place in a folder with images, of one camera or of both views; None without one."""
-    if (folder / "config.yaml").is_file() or _recordings_in(folder):
-        return None
-    places = [path for path in shown_in(folder) if path.is_dir()]
-    places = [folder, *places, *(path / _INSIDE for path in places)]
-    found = [path for path in places if path.is_dir() and images_in(path)]
-    mixed = any("depth" in path.stem.lower() for place in found for path in images_in(place))
-    return found[0] if len(found) == 1 and not mixed else None
+def has_both_views(folder: Path) -> bool:
+    """Whether images right in a folder may show both views: not colour and depth, nor a run's."""
+    found = [] if (folder / "config.yaml").is_file() else images_in(folder)
+    mixed = any("depth" in path.stem.lower() for path in found)
+    return bool(found) and not mixed and not _recordings_in(folder)
 
 
 _SEARCHED = 50  # folders of one level
@@ -166,7 +162,7 @@ def _recordings_in(folder: Path) -> str:
         found = [
             str(path)
             for path in level
-            if any(not layout.lacking(path) for layout in LAYOUTS.values())
+            if any(not layout.lacking(path) for layout in LAYOUTS.values()) or images_in(path)
         ]
         if found:
             more = f" or {len(found) - 3} more" if len(found) > 3 else ""
@@ -483,53 +479,37 @@ def _by_number(files: Sequence[Path], root: Path, split: re.Pattern[str]) -> Cam
 # The layouts
 
 
+def _some(*parts: str) -> Callable[[Path], bool]:
+    """Whether a folder has one of the parts."""
+    return lambda folder: len(_absent(folder, *parts)) < len(parts)
+
+
+def _found(find: Callable[[Path], object], lacking: str) -> Callable[[Path], tuple[str, ...]]:
+    """What a folder lacks in which nothing is found."""
+    return lambda folder: () if find(folder) else (lacking,)
+
+
+_FILMS = "one film, or one of a left and one of a right camera (and one of a top one)"
+_PAIR = "images of a left and a right camera, by their names"
 LAYOUTS = {
     "image_folder": Layout(
         "image folder",
         lambda folder: _absent(folder, "left", "right", "calib.json", "times.txt"),
-        lambda folder: (
-            len(_absent(folder, "left", "right")) < 2
-            or not _absent(folder, "calib.json", "times.txt")
-        ),
+        lambda f: _some("left", "right")(f) or not _absent(f, "calib.json", "times.txt"),
     ),
-    "kitti": Layout(
-        "KITTI odometry",
-        _lacking_of_kitti,
-        lambda folder: len(_absent(folder, "image_0", "image_1")) < 2,
-    ),
-    "euroc": Layout(
-        "EuRoC native",
-        _lacking_of_euroc,
-        lambda folder: len(_absent(folder, "mav0", "cam0/sensor.yaml")) < 2,
-    ),
+    "kitti": Layout("KITTI odometry", _lacking_of_kitti, _some("image_0", "image_1")),
+    "euroc": Layout("EuRoC native", _lacking_of_euroc, _some("mav0", "cam0/sensor.yaml")),
     "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw),
     "bag": Layout(
         "ROS bag",
-        lambda folder: (
-            () if any(map(is_bag, shown_in(folder))) else ("a file *.bag, *.db3 or *.mcap",)
-        ),
+        _found(lambda folder: any(map(is_bag, shown_in(folder))), "a file *.bag, *.db3 or *.mcap"),
         endings=(*_PLAIN_BAGS, _PACKED_BAG),
     ),
-    "video": Layout(
-        "film",
-        lambda folder: (
-            ()
-            if films_in(folder)
-            else ("one film, or one of a left and one of a right camera (and one of a top one)",)
-        ),
-        endings=VIDEO_ENDINGS,
-    ),
-    "rgbd": Layout(
-        "colour and depth", _lacking_of_rgbd, lambda folder: not _absent(folder, "depth.txt")
-    ),
+    "video": Layout("film", _found(films_in, _FILMS), endings=VIDEO_ENDINGS),
+    "rgbd": Layout("colour and depth", _lacking_of_rgbd, _some("depth.txt")),
     "loose_images": Layout(
-        "folder of images",
-        lambda folder: (
-            () if find_cameras(folder) else ("images of a left and a right camera, by their names",)
-        ),
-        lambda folder: only_images(folder) is not None,
-        endings=IMAGE_SUFFIXES,
-        last=True,
+        "folder of images", _found(find_cameras, _PAIR), has_both_views,
+        IMAGE_SUFFIXES, last=True,
     ),
-}
+}  # fmt: skip
 """By the value of ``dataset.kind`` that opens it."""

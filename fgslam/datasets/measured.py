@@ -50,7 +50,7 @@ _NONE: IntArray = np.empty(0, np.int64)
 
 
 def open_measurement_files(
-    settings: MeasurementFilesSettings, odometry: OdometrySettings
+    settings: MeasurementFilesSettings, odometry: OdometrySettings, _: int = 0
 ) -> MeasurementRecording:
     """Opens a folder with a log: a run folder, or what `scripts/convert` wrote.
 
@@ -77,17 +77,11 @@ def open_measurement_files(
     if poses is not None:
         within = poses.timestamps < log.timestamps[-1] + _STAMP_STEP_S
         poses = Trajectory(poses.timestamps[within], poses.poses[within])
-    return MeasurementRecording(
-        name=root.resolve().name,
-        identity=files_identity(
-            [one for one in (path, truth, landmarks) if one.is_file()], asdict(settings)
-        ),
-        log=log,
-        ground_truth=poses,
-        landmark_truth=read_landmark_truth(landmarks)[0] if landmarks.is_file() else None,
-        notes=(),
-        truth_frame="right" if stated is None else stated.frame,
-    )
+    files = [one for one in (path, truth, landmarks) if one.is_file()]
+    name, identity = root.resolve().name, files_identity(files, asdict(settings))
+    known = read_landmark_truth(landmarks)[0] if landmarks.is_file() else None
+    frame = "right" if stated is None else stated.frame
+    return MeasurementRecording(name, identity, log, poses, known, (), frame)
 
 
 # --------------------------------------------------------------------------------------------
@@ -165,7 +159,7 @@ _NOT_RIGID = 1e-3  # the files give six digits
 
 
 def open_stereo_tracks(
-    settings: StereoTracksSettings, odometry: OdometrySettings
+    settings: StereoTracksSettings, odometry: OdometrySettings, _: int = 0
 ) -> MeasurementRecording:
     """Opens one of the files.
 
@@ -178,14 +172,12 @@ def open_stereo_tracks(
         found = find_spec("gtsam")
         if found is None or found.origin is None:
             raise DatasetError(
-                "gtsam is not installed, and the stereo tracks lie inside it; install it or give "
-                "dataset.file a path"
+                "the stereo tracks lie inside gtsam; install it, or give dataset.file a path"
             )
         path = Path(found.origin).parent / "Data" / f"{_PREFIX}{_INSIDE[settings.file]}.txt"
     if not path.is_file():
         raise DatasetError(
-            f"{path}: no such file; dataset.file is {', '.join(_INSIDE)} or the path of a file "
-            f"{_PREFIX}*.txt"
+            f"{path}: no such file; dataset.file is {', '.join(_INSIDE)} or a file {_PREFIX}*.txt"
         )
     suffix = path.stem.removeprefix(_PREFIX)
     calibration = path.with_name(f"VO_calibration{suffix}.txt")
@@ -203,15 +195,10 @@ def open_stereo_tracks(
         notes += ("the reference poses are estimates from the same images, not measured truth",)
     increments = make_increments(_frames(tracks.values[rows], numbers, settings))
     listed = [file for file in (path, calibration, poses) if file.exists()]
-    return MeasurementRecording(
-        name=f"stereo tracks {suffix.removeprefix('_')}",
-        identity=files_identity(listed, asdict(settings) | {"frame_period_s": FRAME_PERIOD_S}),
-        log=make_log(rig, increments, odometry),
-        ground_truth=truth,
-        landmark_truth=None,
-        notes=notes,
-        truth_frame="left",
-    )
+    name = f"stereo tracks {suffix.removeprefix('_')}"
+    identity = files_identity(listed, asdict(settings) | {"frame_period_s": FRAME_PERIOD_S})
+    log = make_log(rig, increments, odometry)
+    return MeasurementRecording(name, identity, log, truth, None, notes, "left")
 
 
 _SPARSE = 10  # times as many as landmarks: arrays by number would be mostly empty
@@ -326,8 +313,8 @@ SIMULATION_VERSION = 2
 """Part of the identity: raised whenever the same settings and seed give other measurements."""
 
 
-def open_simulated_measurements(
-    settings: SimulatedMeasurementsSettings, seed: int, odometry: OdometrySettings
+def open_simulation(
+    settings: SimulatedMeasurementsSettings, odometry: OdometrySettings, seed: int
 ) -> MeasurementRecording:
     """Simulates the drive.
 
@@ -347,13 +334,9 @@ def open_simulated_measurements(
         notes.append(f"odometry off by a factor of {fault.scale:g} for {fault.frames} frames")
     if settings.blackout is not None:
         notes.append(f"cameras blocked for {settings.blackout.frames} frames")
-    return MeasurementRecording(
-        name=f"simulated measurements, {settings.drive.path.replace('_', ' ')}",
-        identity=content_hash(
-            {"settings": asdict(settings), "seed": seed, "simulation": SIMULATION_VERSION}
-        ),
-        log=make_log(simulated.rig, list(simulated.increments), odometry),
-        ground_truth=simulated.truth,
-        landmark_truth=LandmarkTruth(simulated.landmark_ids, simulated.landmark_positions),
-        notes=tuple(notes),
-    )
+    name = f"simulated measurements, {settings.drive.path.replace('_', ' ')}"
+    of_settings = {"settings": asdict(settings), "seed": seed, "simulation": SIMULATION_VERSION}
+    log = make_log(simulated.rig, list(simulated.increments), odometry)
+    landmarks = LandmarkTruth(simulated.landmark_ids, simulated.landmark_positions)
+    known = simulated.truth, landmarks, tuple(notes)
+    return MeasurementRecording(name, content_hash(of_settings), log, *known)

@@ -104,8 +104,7 @@ def find_odometry(root: Path) -> Path | None:
     found = found or [path for path in sorted(root.glob("*.csv")) if is_of_gyroscope(path)]
     if len(found) > 1:
         raise DatasetError(
-            f"{root} has several odometry files ({', '.join(p.name for p in found)}); keep one "
-            "there"
+            f"{root} has several odometry files ({', '.join(p.name for p in found)}); keep one"
         )
     return found[0] if found else None
 
@@ -157,9 +156,8 @@ def recorded_motions(name: str, read: Callable[[], OdometrySource]) -> OdometryS
         steps = read()(frames)
         if len(frames) > 1 and all(step is None for step in steps):
             raise OdometryError(
-                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
-                "that both use one clock, or say what is to be added to its times: --set "
-                "odometry.time_offset_s=SECONDS"
+                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); say "
+                "what is to be added to its times: --set odometry.time_offset_s=SECONDS"
             )
         return steps
 
@@ -305,9 +303,8 @@ def motions_of(
         return lambda frames: gyroscope_motions(stamps, body, frames, noise or GyroscopeNoise())
     else:
         raise OdometryError(
-            f"{path}: columns {', '.join(sorted(columns))} were understood; needed are time with "
-            "speed and yaw_rate, x, y and yaw (or qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; "
-            "name the columns so"
+            f"{path}: columns {', '.join(sorted(columns))} were understood; name time with "
+            "speed and yaw_rate, x, y and yaw (or qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z"
         )
     from scipy.spatial.transform import Rotation  # slow to load, and not all have odometry
 
@@ -401,8 +398,7 @@ _TRANSLATION_FLOOR_M, _ROTATION_FLOOR_DEG = 0.002, 0.1
 def pose_motions(log: Trajectory, frames: FloatArray, settings: RecordedOdometrySettings) -> Steps:
     """Body motions between frames (m,) by recorded poses."""
     poses = interpolate_poses(log, frames)
-    motions = inverse(poses[:-1]) @ poses[1:]
-    covariances = [pose_noise(motion, settings) for motion in motions]
+    covariances = [pose_noise(m, settings) for m in inverse(poses[:-1]) @ poses[1:]]
     # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
     known = steps_covered(log.timestamps, frames, _MAX_GAP_S, _POSE_HOLD_S)
     return _steps(poses, covariances, known)

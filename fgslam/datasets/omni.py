@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -17,19 +17,20 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.omni import (
-    Equirectangular,
-    LensCamera,
-    OmniCamera,
-    RadialCamera,
-)
+from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
 from fgslam.cameras.omni_files import make_camera
 from fgslam.cameras.rings import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.files import read_text, shown_in
 from fgslam.core.geometry import wrap
-from fgslam.datasets.images import read_colour_image, require_folder
+from fgslam.datasets.images import (
+    read_colour_image,
+    readable,
+    require_folder,
+    require_size,
+    spread_over,
+)
 from fgslam.datasets.layouts import IMAGE_SUFFIXES, natural
 from fgslam.datasets.recording import recording_identity, select_frames
 from fgslam.datasets.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
@@ -83,14 +84,8 @@ class OmniRecording:
         """
         if not 0 <= i < len(self):
             raise IndexError(f"picture {i} of {self.name}: expected 0 to {len(self) - 1}")
-        image = self.load_image(i)
-        if image.shape[:2] != (self.camera.height, self.camera.width):
-            raise FrameError(
-                f"{self.name}: picture {self.names[i]} has {image.shape[1]}x{image.shape[0]} "
-                f"pixels, but the camera is calibrated for {self.camera.width}x"
-                f"{self.camera.height}; all pictures must have that size"
-            )
-        return image
+        name, of = f"{self.name}: picture {self.names[i]}", self.camera
+        return require_size(self.load_image(i), name, of.width, of.height)
 
     def select(self, chosen: IntArray) -> OmniRecording:
         """Those pictures alone, in that order."""
@@ -109,30 +104,6 @@ class OmniRecording:
 
 # --------------------------------------------------------------------------------------------
 # Pictures of a mirror: a folder along a path, a video
-
-
-def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
-    """Open a folder of mirror images, in the order of the numbers in their names.
-
-    Raises:
-        DatasetError: the folder is absent or holds no such picture.
-        CalibrationError: the camera is impossible, or calibrated for another size.
-        FrameError: the first picture cannot be read.
-    """
-    root = Path(settings.path)
-    paths = pictures_in(root, settings.pattern)
-    chosen = select_frames(len(paths), settings, settings.path)
-    first = read_colour_image(paths[int(chosen[0])])
-    recording = OmniRecording(
-        name=root.resolve().name,
-        identity=recording_identity([], paths),
-        camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), root),
-        ids=ids_of([path.stem for path in paths]),
-        names=tuple(path.name for path in paths),
-        timestamps=_times(paths, root),
-        load_image=lambda i: read_colour_image(paths[i]),
-    )
-    return recording.select(chosen)
 
 
 def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
@@ -200,12 +171,6 @@ def ids_of(names: Sequence[str]) -> IntArray:
     return np.array(last if known else range(len(names)), np.int64)
 
 
-def _times(images: Sequence[Path], folder: Path) -> FloatArray:
-    """Stamps (n,) of a folder's images, by a list in it or their names; NaN without."""
-    written = written_stamps(images, [folder])
-    return np.full(len(images), np.nan) if written is None else written.seconds
-
-
 # --------------------------------------------------------------------------------------------
 # A folder of panoramas, with or without surveyed poses
 
@@ -216,52 +181,55 @@ _NUMBERS = ("x_m", "y_m", "heading_deg")
 _COLUMNS = ("id", "file", *_NUMBERS)
 
 
-def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
-    """Open a folder of panoramas: those in ``poses.csv`` in its order, else all by their numbers.
+def open_pictures(settings: PanoramasSettings | OmniPathSettings) -> OmniRecording:
+    """Open a folder of pictures in the order of the numbers in their names.
+
+    Of panoramas, those in ``poses.csv`` in its order, where that is there.
 
     Raises:
         DatasetError: the folder, a picture or a row is missing, malformed or listed twice.
-        CalibrationError: the panorama's elevations are impossible.
+        CalibrationError: the camera is impossible, or calibrated for another size.
         FrameError: the first picture cannot be read.
     """
     root = Path(settings.path)
-    require_folder(root, "the folder of panoramas")
-    table, pictures = root / POSES_FILE, root / _PICTURES
-    listed = _read_places(table) if table.is_file() else None
-    paths = listed[0] if listed else pictures_in(pictures if pictures.is_dir() else root)
+    require_folder(root, "the folder of pictures")
+    table, inner, listed, width = root / POSES_FILE, root / _PICTURES, None, None
+    if isinstance(settings, OmniPathSettings):
+        paths = pictures_in(root, settings.pattern)
+    else:
+        width, listed = settings.width, _read_places(table) if table.is_file() else None
+        paths = listed[0] if listed else pictures_in(inner if inner.is_dir() else root)
     chosen = select_frames(len(paths), settings, settings.path)
     first = read_colour_image(paths[int(chosen[0])])
     size = reduced = (first.shape[1], first.shape[0])
-    if settings.width is not None and settings.width != size[0]:
-        if settings.width > size[0]:
+    if width is not None and width != size[0]:
+        if width > size[0]:
             raise DatasetError(
-                f"dataset.width is {settings.width} but the panoramas of {root} have only "
-                f"{size[0]} columns; give a smaller width, or null"
+                f"dataset.width is {width} but the panoramas of {root} have only {size[0]} "
+                "columns; give a smaller width, or null"
             )
-        reduced = (settings.width, max(2, round(settings.width * size[1] / size[0])))
+        reduced = (width, max(2, round(width * size[1] / size[0])))
     reduction = None if reduced == size else PanoramaReduction(size, reduced)
 
     def load(i: int) -> Image:
         image = read_colour_image(paths[i])
-        if (image.shape[1], image.shape[0]) != size:
-            raise FrameError(
-                f"panorama {paths[i]} has {image.shape[1]}x{image.shape[0]} pixels, the first one "
-                f"{size[0]}x{size[1]}; all must have one size"
-            )
-        return image if reduction is None else reduction(image)
+        if reduction is None:
+            return image
+        return reduction(require_size(image, f"picture {paths[i]}", *size))
 
+    written = written_stamps(paths, [root])
     recording = OmniRecording(
         name=root.resolve().name,
         identity=recording_identity([table] if listed else [], paths),
         camera=make_camera(settings.camera, reduced, root),
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
-        timestamps=_times(paths, root),
+        timestamps=np.full(len(paths), np.nan) if written is None else written.seconds,
         load_image=load,
     )
     if listed is not None:
         # Plans lie next to poses.csv, too; pictures that no row names are looked for in panos/.
-        inside = pictures.iterdir() if pictures.is_dir() else ()
+        inside = inner.iterdir() if inner.is_dir() else ()
         extra = [p for p in inside if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
         note = f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}"
         _, ids, poses, rooms = listed
@@ -285,8 +253,7 @@ def _read_places(
     try:
         if absent := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
             raise DatasetError(
-                f"{path}, line 1: no column {', '.join(absent)}; the header must name "
-                f"{', '.join(_COLUMNS)}"
+                f"{path}, line 1: no column {', '.join(absent)}; name {', '.join(_COLUMNS)}"
             )
         for row in reader:
             line, where = reader.line_num, f"{path}, line {reader.line_num}"
@@ -313,8 +280,7 @@ def _read_places(
             for key, what in ((number, "id"), (file, "file")):
                 if seen.setdefault(key, line) != line:
                     raise DatasetError(
-                        f"{where}: {what} {key} is in line {seen[key]} already; remove one of the "
-                        "rows"
+                        f"{where}: {what} {key} is in line {seen[key]} already; remove one"
                     )
     except csv.Error as cause:
         where = f"{path}, line {reader.reader.line_num}"
@@ -448,8 +414,8 @@ def _end_notes(recording: OmniRecording, camera: Equirectangular) -> tuple[str, 
     """
     at_pole = np.isclose([camera.top_elevation, -camera.bottom_elevation], 0.5 * np.pi)
     found = []
-    places = np.linspace(0, len(recording) - 1, _SPREAD_OVER).astype(np.int64)
-    for grey in (image.mean(axis=2) for image in _pictures(recording, np.unique(places))):
+    for image in readable(recording.image, spread_over(len(recording), _SPREAD_OVER)):
+        grey = image.mean(axis=2)
         lit = np.flatnonzero(grey.max(axis=0) > _BLACK)
         if not len(lit):
             continue
@@ -494,13 +460,6 @@ def _is_round(grey: FloatArray) -> bool:
     return float(corners.max()) <= _BLACK < float(rows.mean(axis=1).max())
 
 
-def _pictures(recording: OmniRecording, places: Iterable[int]) -> Iterator[Image]:
-    """Those pictures, without damaged ones."""
-    for k in places:
-        with suppress(FrameError):
-            yield recording.image(int(k))
-
-
 def _mirror_notes(
     recording: OmniRecording, centre: tuple[float, float], radius: float, always: bool
 ) -> tuple[str, ...]:
@@ -512,7 +471,7 @@ def _mirror_notes(
         return None
 
     circles = []
-    for image in _pictures(recording, range(min(_CHECKED, len(recording)))):
+    for image in readable(recording.image, range(min(_CHECKED, len(recording)))):
         # The rim near where it should be, else around any circle: its holder's, say, is concentric.
         found = circle(image, (centre, radius))
         if found is None and (around := circle(image, None)) is not None:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -18,10 +18,10 @@ import numpy as np
 
 from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.errors import DatasetError
 from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import body_is_camera
-from fgslam.datasets.images import Depth, DepthLoader
+from fgslam.datasets.images import Depth, DepthLoader, readable
 from fgslam.datasets.ledger import DEPTH, LENGTH, LENS, ODOMETRY, Entry
 from fgslam.datasets.recording import MOUNTING, Recording
 from fgslam.datasets.settings import (
@@ -48,8 +48,14 @@ READERS: Mapping[str, Callable[[], Any]] = {
     "kitti": lambda: import_module("fgslam.datasets.published").open_kitti,
     "kitti_raw": lambda: import_module("fgslam.datasets.published").open_kitti_raw,
     "euroc": lambda: import_module("fgslam.datasets.published").open_euroc,
+    "stereo_tracks": lambda: import_module("fgslam.datasets.measured").open_stereo_tracks,
+    "measurements": lambda: import_module("fgslam.datasets.measured").open_measurement_files,
+    "simulated_measurements": lambda: import_module("fgslam.datasets.measured").open_simulation,
+    "panoramas": lambda: import_module("fgslam.datasets.omni").open_pictures,
+    "omni_path": lambda: import_module("fgslam.datasets.omni").open_pictures,
+    "omni_video": lambda: import_module("fgslam.datasets.omni").open_omni_video,
 }
-"""By kind of the settings what reads a recording: ``(settings, odometry) -> Recording``."""
+"""By kind of the settings what opens a recording."""
 
 
 def open_recording(
@@ -203,14 +209,10 @@ def open_measurements(
         DatasetError: the recording is missing, malformed or empty.
         ConfigError: a simulated drive cannot be driven, or synthetic odometry is asked for.
     """
-    odometry = odometry or RecordedOdometrySettings()
-    from fgslam.datasets import measured
-
-    if settings.kind == "stereo_tracks":
-        return measured.open_stereo_tracks(settings, odometry)
-    if settings.kind == "measurements":
-        return measured.open_measurement_files(settings, odometry)
-    return measured.open_simulated_measurements(settings, seed, odometry)
+    found: MeasurementRecording = READERS[settings.kind]()(
+        settings, odometry or RecordedOdometrySettings(), seed
+    )
+    return found
 
 
 def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
@@ -220,13 +222,8 @@ def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
         DatasetError: it is missing, malformed or empty; of these CalibrationError, where the
             camera is concerned, and FrameError, where the first picture cannot be read.
     """
-    from fgslam.datasets import omni
-
-    if settings.kind == "panoramas":
-        return omni.open_panoramas(settings)
-    if settings.kind == "omni_path":
-        return omni.open_omni_path(settings)
-    return omni.open_omni_video(settings)
+    found: OmniRecording = READERS[settings.kind]()(settings)
+    return found
 
 
 def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
@@ -331,13 +328,7 @@ def fit_notes(
 
 
 def _first_pairs(load: Callable[[int], tuple[Image, ...]], count: int) -> list[tuple[Image, ...]]:
-    pairs: list[tuple[Image, ...]] = []
-    for index in range(min(count, _TRIED)):
-        with suppress(FrameError):
-            pairs.append(load(index)[:2])
-        if len(pairs) == _PAIRS:
-            break
-    return pairs
+    return [images[:2] for images in islice(readable(load, range(min(count, _TRIED))), _PAIRS)]
 
 
 def _first_rows(recording: Recording) -> FloatArray:

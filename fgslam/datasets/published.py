@@ -5,7 +5,6 @@ docs/datasets/published.md.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,19 +22,14 @@ from fgslam.cameras.formats import (
 from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.files import read_lines, read_text, shown_in
+from fgslam.core.files import read_text, shown_in
 from fgslam.core.geometry import inverse, pose, right_from_left_camera
 from fgslam.core.sensors import body_is_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
 from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
-from fgslam.datasets.odometry import (
-    SPEED_COLUMNS,
-    gyroscope_odometry,
-    motions_of,
-    recorded_motions,
-)
+from fgslam.datasets.odometry import SPEED_COLUMNS, gyroscope_odometry, motions_of, recorded_motions
 from fgslam.datasets.recording import (
     Recording,
     image_recording,
@@ -53,6 +47,7 @@ from fgslam.datasets.settings import (
 from fgslam.datasets.times import (
     NANOSECONDS,
     Table,
+    listed_files,
     pair_files,
     pair_stamps,
     poses_of,
@@ -136,29 +131,7 @@ def read_camera_frames(folder: Path) -> tuple[IntArray, list[Path]]:
         DatasetError: the file is missing, empty or malformed, or stamps do not increase.
     """
     path = folder / "data.csv"
-    lines = read_lines(path)
-    if lines and not re.search(r"\d", lines[0][1].partition(",")[0]):
-        lines = lines[1:]  # names of columns
-    stamps: list[int] = []
-    paths: list[Path] = []
-    for line, text in lines:
-        stamp, _, rest = text.partition(",")
-        stamp, name = stamp.strip(), rest.partition(",")[0].strip()
-        if not stamp.isdecimal() or not name:
-            raise DatasetError(
-                f"{path}, line {line}: expected a stamp in whole nanoseconds and a file name; "
-                "correct the line, or all stamps (seconds: times 1e9)"
-            )
-        if stamps and int(stamp) <= stamps[-1]:
-            raise DatasetError(
-                f"{path}, line {line}: stamp {stamp} does not come after {stamps[-1]}; put the "
-                "lines in time order and remove duplicates"
-            )
-        stamps.append(int(stamp))
-        paths.append(folder / "data" / name)
-    if not stamps:
-        raise DatasetError(f"{path} lists no image; restore the file")
-    found = np.array(stamps, np.int64)
+    found, paths = listed_files(path, folder / "data", ",")
     step = float(np.median(np.diff(found))) if len(found) > 1 else np.inf
     if step < _FASTEST_NS:
         raise DatasetError(
@@ -210,9 +183,8 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     if pair is None:
         lacking = next(name for name in ("image_1", "image_0") if not (folder / name).is_dir())
         raise DatasetError(
-            f"{folder} has no {lacking}/: both grey cameras are needed (image_0 left, image_1 "
-            "right), or both colour cameras (image_2 left, image_3 right); unpack the odometry "
-            "data set there"
+            f"{folder} has no {lacking}/: unpack both grey cameras (image_0 left, image_1 "
+            "right), or both colour cameras (image_2 left, image_3 right), there"
         )
     cameras = {
         name: list_numbered_images(folder / name)
@@ -228,8 +200,7 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     size = first_size(frame[0] for frame in paths)  # which calib.txt does not state
     if size is None:
         raise DatasetError(
-            f"{folder}: not one frame of times.txt has a readable image of both cameras; "
-            "check the unpacked files"
+            f"{folder}: no frame of times.txt has a readable image of both; unpack it again"
         )
     rig = load_rig(calibration, size=size)
     images, noticed = open_frames(paths, rig, folder)

@@ -168,19 +168,9 @@ def image_recording(
             entry = Entry(LENGTH, "1 m", f"{rig.format} states none", "--unit", guessed=True)
             ledger = (entry, *ledger)
         plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
-    return Recording(
-        name,
-        plain,
-        stamps[indices],
-        recording_identity(*files),
-        notes,
-        indices,
-        load_images,
-        rectifier=rectifier,
-        ledger=ledger,
-        calibration=getattr(rig, "file", ""),
-        **more,
-    )
+    more |= {"rectifier": rectifier, "ledger": ledger, "calibration": getattr(rig, "file", "")}
+    identity = recording_identity(*files)
+    return Recording(name, plain, stamps[indices], identity, notes, indices, load_images, **more)
 
 
 TRUTH_RIGHT, TRUTH_LEFT = "gt_right_cam.txt", "gt_left_cam.txt"
@@ -315,8 +305,7 @@ def select_frames(count: int, settings: FrameSelection, name: str) -> IntArray:
         )
     if settings.start >= count:
         raise DatasetError(
-            f"dataset.start is {settings.start} but {name} has only the frames 0 to "
-            f"{count - 1}: choose a smaller start"
+            f"dataset.start is {settings.start} but {name} has frames 0 to {count - 1}: choose less"
         )
     if settings.stop is not None and settings.stop <= settings.start:
         raise DatasetError(
@@ -393,23 +382,13 @@ def loaded_rig(
 
     Where the images are of a ``pair`` and the file has three cameras, those of its first two.
     """
-
-    def load(cameras: Sequence[int] | None) -> StereoRig:
-        return load_rig(
-            *files,
-            size=size,
-            scale=settings.resized,
-            unit_m=settings.unit_m,
-            fov_deg=settings.fov_deg,
-            cameras=cameras,
-            lens=settings.lens,
-        )
-
-    rig = load(cameras)
+    asked: dict[str, Any] = {key: getattr(settings, key) for key in ("unit_m", "fov_deg", "lens")}
+    load = partial(load_rig, *files, size=size, scale=settings.resized, **asked)
+    rig = load(cameras=cameras)
     if not pair or max(rig.sources) < 2:
         return rig
     text = f"{files[0]} holds three cameras, the images are of two: the first two are taken"
-    two = load((0, 1))
+    two = load(cameras=(0, 1))
     return replace(two, remarks=(text, *two.remarks))
 
 

@@ -137,14 +137,8 @@ class RenderedLabSequence:
     def notes(self) -> tuple[str, ...]:
         """Which effects are on."""
         effects = self._settings.effects
-        return tuple(
-            f"effect: {name}"
-            for name, value in (
-                ("person", effects.person),
-                ("blocked frames", effects.blocked_frames),
-            )
-            if value is not None
-        )
+        known = {"person": effects.person, "blocked frames": effects.blocked_frames}
+        return tuple(f"effect: {name}" for name, value in known.items() if value is not None)
 
     def __len__(self) -> int:
         """Number of selected frames."""

@@ -35,10 +35,7 @@ class RecordingSettings(FrameSelection):
 
     path: str = Field(min_length=1, description="folder of the recording")
     scale: float = Field(
-        default=1.0,
-        gt=0.0,
-        le=1.0,
-        description="images are made smaller by this, the calibration too",
+        default=1.0, gt=0.0, le=1.0, description="by which images and calibration are made smaller"
     )
 
 
@@ -46,39 +43,27 @@ class RecordingSettings(FrameSelection):
 class CalibratedSettings(RecordingSettings):
     """What a recording has whose calibration may be another file than its own."""
 
-    camera_file: str | None = Field(
-        default=None,
-        description="calibration in place of the recording's own (docs/howto/your_camera.md)",
-    )
+    camera_file: str | None = Field(default=None, description="calibration in place of its own")
     resized: bool = Field(
-        default=False,
-        description="the images were made smaller or larger as a whole after calibration: "
-        "scale it to them",
+        default=False, description="images were resized as a whole: scale the calibration"
     )
     fov_deg: float | None = Field(
         default=None,
         gt=0.0,
         lt=170.0,
-        description="horizontal angle of the rectified view; null: as wide as cameras fill",
+        description="horizontal, of the rectified view; null: all that cameras fill",
     )
     unit_m: Positive = Field(
-        default=1.0,
-        description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "
-        "the side of a square for one in squares",
+        default=1.0, description="metres of the calibration's unit: 0.001, the side of a square"
     )
     lens: Literal["radtan", "equidistant"] | None = Field(
-        default=None,
-        description="what four coefficients are whose model the calibration does not state; null: "
-        "by the rows of the first pairs",
+        default=None, description="model of four coefficients; null: as stated, or by rows of pairs"
     )
     camera_yaw_deg: float | None = Field(
-        default=None,
-        description="heading of the camera in the body, degrees to the left; null: as calibrated",
+        default=None, description="of the camera in the body, degrees to the left; null: calibrated"
     )
     lever_arm_m: Vector3 | None = Field(
-        default=None,
-        description="position of the right camera in the body, forward, left, up; null: as "
-        "calibrated",
+        default=None, description="right camera in the body, forward, left, up; null: calibrated"
     )
 
 
@@ -96,7 +81,7 @@ class LooseImagesSettings(CalibratedSettings):
     path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
     kind: Literal["loose_images"] = "loose_images"
     fps: FramesASecond | None = Field(
-        default=None, description="frames a second; null: by the list of times or by names, else 10"
+        default=None, description="frames a second; null: as stated, else 10"
     )
 
 
@@ -107,7 +92,7 @@ class VideoSettings(CalibratedSettings):
     path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
     kind: Literal["video"] = "video"
     fps: FramesASecond | None = Field(
-        default=None, description="frames a second, in place of the film's own rate"
+        default=None, description="frames a second; null: as stated, else 10"
     )
 
 
@@ -117,14 +102,12 @@ class DepthSettings(CalibratedSettings):
 
     depth_scale: Positive | None = Field(
         default=None,
-        description="depth units in a metre; null: as the recording or the calibration's file "
-        "states, else 5000 (TUM), 1000 (16 bits), 1 (floats)",
+        description="units in a metre; null: as stated, else 5000 (TUM), 1000 or 1 (floats)",
     )
     colour_camera: int | None = Field(
         default=None,
         ge=0,
-        description="which of the calibration's cameras, from 0, took the colour images; null: by "
-        "its topic, its size, or its name",
+        description="the calibration's camera, from 0; null: by topic, size or name",
     )
 
 
@@ -134,7 +117,7 @@ class RgbdSettings(DepthSettings):
 
     kind: Literal["rgbd"] = "rgbd"
     fps: FramesASecond | None = Field(
-        default=None, description="frames a second; null: by lists of times or by names, else 10"
+        default=None, description="frames a second; null: as stated, else 10"
     )
 
 
@@ -145,8 +128,7 @@ class BagSettings(DepthSettings):
     path: str = Field(min_length=1, description="the bag, its folder, or a pattern of file names")
     kind: Literal["bag"] = "bag"
     topics: tuple[str, ...] = Field(
-        default=(),
-        description="topics: left, right[, top] images, odometry; empty: by type and name",
+        default=(), description="left, right[, top], odometry; empty: by type and name"
     )
 
 
@@ -163,7 +145,7 @@ class KittiSettings(RecordingSettings):
 
     kind: Literal["kitti"] = "kitti"
     sequence: str = Field(
-        default="00", pattern=r"^\d{2}$", description='which drive, two digits in quotes: "06"'
+        default="00", pattern=r"^\d{2}$", description='which drive, in quotes: "06"'
     )
 
 
@@ -197,12 +179,9 @@ class StereoTracksSettings(FrameSelection):
     file: str = Field(
         default="00s",
         min_length=1,
-        description='"00s", "00" or "large" of gtsam; or a file VO_stereo_factors*.txt',
+        description='"00s", "00", "large", or a file VO_stereo_factors*.txt',
     )
-    pixel_sigma: Positive = Field(
-        default=0.25,
-        description="noise of one image coordinate, pixels (measured: docs/datasets/published.md)",
-    )
+    pixel_sigma: Positive = Field(default=0.25, description="noise of one image coordinate, pixels")
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -235,10 +214,7 @@ class PanoramasSettings(RecordingSettings):
     kind: Literal["panoramas"] = "panoramas"
     camera: EquirectangularSettings = EquirectangularSettings()
     width: int | None = Field(
-        default=None,
-        ge=64,
-        le=16384,
-        description="pictures are reduced to this width; null: as they are",
+        default=None, ge=64, le=16384, description="to which pictures are reduced; null: none"
     )
 
 
@@ -249,10 +225,7 @@ class OmniPathSettings(RecordingSettings):
     kind: Literal["omni_path"] = "omni_path"
     camera: OmniCameraSettings = HyperbolicMirrorSettings()
     pattern: str = Field(
-        default="*",
-        min_length=1,
-        pattern=r"^[^/\\]+$",
-        description="names of the pictures, ordered by the numbers in them",
+        default="*", min_length=1, pattern=r"^[^/\\]+$", description="names of the pictures"
     )
 
 
@@ -293,9 +266,7 @@ class RecordedOdometrySettings:
 
     kind: Literal["recorded"] = "recorded"
     time_offset_s: float = Field(
-        default=0.0,
-        allow_inf_nan=False,
-        description="added to the odometry's time stamps, seconds",
+        default=0.0, allow_inf_nan=False, description="added to its time stamps, seconds"
     )
     speed_sigma_mps: Positive = Field(
         default=0.10, description="speed and yaw rate: noise of the forward speed, m/s"

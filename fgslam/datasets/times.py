@@ -112,8 +112,7 @@ def require_increasing(
         k = int(bad[0])
         raise error(
             f"{table.path}, line {table.lines[k + 1]}: time {stamps[k + 1]:.6f} s does not come "
-            f"after {stamps[k]:.6f} s of line {table.lines[k]}; put the lines in time order and "
-            "remove duplicates"
+            f"after {stamps[k]:.6f} s of line {table.lines[k]}; put the lines in time order"
         )
 
 
@@ -236,10 +235,7 @@ def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
 
 
 def pair_stamps(
-    reference: IntArray,
-    others: Sequence[tuple[str, str, IntArray]],
-    name: str,
-    side: str = "right",
+    reference: IntArray, others: Sequence[tuple[str, str, IntArray]], name: str, side: str = "right"
 ) -> tuple[IntArray, tuple[str, ...], Entry]:
     """Rows (n, 1 + others) of images that are each other's nearest in time, and notes.
 
@@ -449,6 +445,50 @@ def _in_seconds(
 # Lists
 
 
+_STAMPS = {
+    None: (r"\d+(\.\d+)?", "seconds and a file; correct the line"),
+    ",": (r"\d+", "a stamp in whole nanoseconds and a file name; correct the line, or all stamps "
+          "(seconds: times 1e9)"),
+}  # fmt: skip
+"""By what separates the columns of a list: its stamps, and what is expected."""
+
+
+def listed_files(
+    path: Path, folder: Path | None = None, delimiter: str | None = None
+) -> tuple[IntArray, list[Path]]:
+    """Increasing stamps (n,) in nanoseconds, and files in a folder, of a list of both.
+
+    Args:
+        path: the list: TUM's of seconds, or with commas EuRoC's of nanoseconds.
+        folder: of the files; None: that of the list.
+        delimiter: of the columns; None for white space.
+
+    Raises:
+        DatasetError: it is missing, empty or malformed, or stamps do not increase.
+    """
+    stamp, expected = _STAMPS[delimiter]
+    lines = read_lines(path)
+    if lines and not re.search(r"\d", lines[0][1].partition(delimiter or " ")[0]):
+        lines = lines[1:]  # names of columns
+    stamps: list[int] = []
+    files: list[Path] = []
+    for line, text in lines:
+        time, name = (*map(str.strip, text.split(delimiter)), "", "")[:2]
+        if not re.fullmatch(stamp, time) or not name:
+            raise DatasetError(f"{path}, line {line}: expected {expected}")
+        whole, _, part = time.partition(".")
+        stamps.append(int(whole) if delimiter else int(whole + part[:9].ljust(9, "0")))
+        if stamps[1:] and stamps[-1] <= stamps[-2]:
+            raise DatasetError(
+                f"{path}, line {line}: stamp {time} does not come after that before; put the "
+                "lines in time order and remove duplicates"
+            )
+        files.append((folder or path.parent) / name)
+    if not stamps:
+        raise DatasetError(f"{path} lists no image; restore the file")
+    return np.array(stamps, np.int64), files
+
+
 _NUMBER = re.compile(r"\d+(\.\d*)?([eE][-+]?\d+)?")
 _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
@@ -476,8 +516,7 @@ def _listed(path: Path, images: Sequence[Path], every: Sequence[Path]) -> list[s
     if not rows or any(len(row) < 2 for row in rows):
         if len(rows) < len(every):
             raise DatasetError(
-                f"{path} has {len(rows)} times for {len(every)} images; restore the list, or leave "
-                "it out and say --fps"
+                f"{path} has {len(rows)} times for {len(every)} images; leave it out and say --fps"
             )
         for row, (number, _) in zip(rows, lines, strict=True):
             if not _NUMBER.fullmatch(row[0]):

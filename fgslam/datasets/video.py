@@ -378,8 +378,7 @@ class VideoFrames:
     def _open(self) -> cv2.VideoCapture:
         if not self._path.is_file():
             raise DatasetError(
-                f"video {self._path} does not exist; check dataset.path, or say where it is: "
-                "--set dataset.path=FILE"
+                f"video {self._path} does not exist; say where it is: --set dataset.path=FILE"
             )
         capture = cv2.VideoCapture(str(self._path))
         if not capture.isOpened():

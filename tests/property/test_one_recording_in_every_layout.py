@@ -170,7 +170,8 @@ def folder(case: Case, root: Path) -> tuple[Path, dict[str, str]]:
     """Images named by their times, truth, and a file of odometry."""
     for k in range(FRAMES):
         for camera, image in case.views(k).items():
-            save(root / camera / f"{case.stamps(camera)[k]}.png", image)
+            place = root if case.together else root / camera
+            save(place / f"{case.stamps(camera)[k]}.png", image)
     chain(case, root)
     seconds, wheel_poses = 1e-9 * np.array(case.stamps("right")), wheels()
     if np.array_equal(case.apart[:3, :3], np.eye(3)):  # it is of the rectified camera

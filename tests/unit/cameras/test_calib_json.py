@@ -102,7 +102,7 @@ def test_a_rig_without_correction_needs_no_rectifier(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"left.yew": 0.1}, "has 'left.yew', which is no term; known: left.column"),
+        ({"left.yew": 0.1}, "has 'left.yew', no term; known: left.column"),
         ({"left.yaw": "much"}, "left.yaw is 'much', not a finite number"),
     ],
 )

@@ -245,7 +245,7 @@ def test_swapped_names_are_taken_by_geometry() -> None:
         (((0.0, 0.0, 0.0), (0.0, 0.0, 0.3)), "not side by side"),
         (((0.0, 0.0, 0.0), (0.2, 0.2, 0.0)), "not side by side"),
         (((0.0, 0.0, 0.0), (0.0, 0.0, 1e-4)), r"are 0\.1 mm apart, as one camera"),
-        (((0.0, 0.0, 0.0),) * 4, r"holds 4 cameras; say which .* cameras=\(0, 1\)"),
+        (((0.0, 0.0, 0.0),) * 4, r"4 cameras; say which .* cameras=\(0, 1\)"),
     ],
 )
 def test_what_is_no_rig_is_refused(

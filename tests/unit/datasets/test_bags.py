@@ -141,7 +141,7 @@ def test_topics_may_be_named_and_depth_is_no_view(tmp_path: Path) -> None:
     for topics, message in (
         (("/nothing",), r"has no topic /nothing with messages; it has /cam/left/camera_info"),
         (("/cam/left/image_raw",), "1 topics of images are named; name the left camera's and"),
-        (("/cam/left/camera_info",), "is sensor_msgs/msg/CameraInfo, which is no image"),
+        (("/cam/left/camera_info",), "is sensor_msgs/msg/CameraInfo, no image or odometry"),
     ):
         with pytest.raises(DatasetError, match=message):
             opened(path, topics=topics)
@@ -264,7 +264,7 @@ def test_three_cameras(tmp_path: Path) -> None:
 def test_three_cameras_need_a_calibration_of_three(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", views(dict.fromkeys(TRIO.values(), 10)))
     topics = tuple(TRIO.values())
-    with pytest.raises(DatasetError, match=r"need one calibration of all three cameras \(none\)"):
+    with pytest.raises(DatasetError, match=r"need one calibration of three cameras \(none\)"):
         opened(path, topics=topics)
     pair = camchain(tmp_path, {"left": "", "right": ""})
     with pytest.raises(DatasetError, match=r"\(camchain\.yaml is of 2\); give it by --camera FILE"):
@@ -325,7 +325,7 @@ def test_a_camera_info_without_baseline(tmp_path: Path) -> None:
     messages = [
         (t, s, k, camera_info(0.0) if k.endswith("CameraInfo") else f) for t, s, k, f in stereo(2)
     ]
-    with pytest.raises(CalibrationError, match="states no baseline"):
+    with pytest.raises(CalibrationError, match="has no baseline"):
         opened(write_bag(tmp_path / "a.bag", messages))
 
 
@@ -757,7 +757,7 @@ def test_a_tree_that_says_nothing_is_one_line(tmp_path: Path, words: str) -> Non
     with pytest.raises(CalibrationError, match=words) as raised:
         opened(path)
     assert "\n" not in str(raised.value)
-    assert "states no baseline" in str(raised.value)
+    assert "has no baseline" in str(raised.value)
     assert "give the calibration of both by --camera FILE" in str(raised.value)
     write_calibration(tmp_path)
     assert opened(path, camera_file=str(tmp_path / "calib.json")).rig.baseline == BASELINE
@@ -1086,7 +1086,7 @@ def test_what_is_no_depth_is_said(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"dataset\.unit_m is for two cameras"):
         opened(bag, unit_m=0.001)
     uncalibrated = [each for each in walk() if not each[0].endswith("camera_info")]
-    with pytest.raises(CalibrationError, match=f"no camera_info belongs to {COLOUR}; give its cal"):
+    with pytest.raises(CalibrationError, match=f"no camera_info of {COLOUR}; give one"):
         opened(write_bag(tmp_path / "bare.mcap", uncalibrated))
 
 

@@ -175,7 +175,7 @@ def test_bad_folders_and_pictures(home: Path, tmp_path: Path) -> None:
         panoramas(home / "empty")
     write(home / "panos" / "a.png", picture(0, 66, 32))
     recording = panoramas(home)
-    with pytest.raises(FrameError, match=r"a\.png has 66x32 pixels, the first one 64x32"):
+    with pytest.raises(FrameError, match=r"a\.png is 66x32 but the calibration states 64x32"):
         recording.image(1)
     data = (home / "panos" / "b.png").read_bytes()
     (home / "panos" / "b.png").write_bytes(data[: len(data) // 2])
@@ -203,7 +203,7 @@ def test_a_path_of_mirror_images(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no picture named \.\. "):
         open_omni(OmniPathSettings(path=str(tmp_path), pattern="..", camera=camera))
     write(tmp_path / "m2.png", picture(2, 48, 64))
-    with pytest.raises(FrameError, match=r"m2\.png has 48x64 .* calibrated for 64x48"):
+    with pytest.raises(FrameError, match=r"m2\.png is 48x64 but the calibration .* 64x48"):
         recording.image(1)
     with pytest.raises(CalibrationError, match=r"calibrated for 320x240 pixels, but .* 64x48"):
         open_omni(

@@ -184,5 +184,5 @@ def test_a_bag_that_is_compressed_as_a_whole(tmp_path: Path) -> None:
         again = open_recording(BagSettings(path=str(given)), RecordedOdometrySettings())
         assert codes(again) == [(10, 60), (11, 61), (12, 62)]
     (file.parent / "metadata.yaml").unlink()
-    with pytest.raises(DatasetError, match=r"compressed as a whole.* zstd -d packed\.db3\.zstd"):
+    with pytest.raises(DatasetError, match=r"is packed.* zstd -d packed\.db3\.zstd"):
         open_recording(BagSettings(path=str(file)), RecordedOdometrySettings())

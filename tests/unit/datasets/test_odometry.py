@@ -237,7 +237,7 @@ def test_absurd_pose_names_the_line(tmp_path: Path) -> None:
 
 def test_log_of_another_clock(tmp_path: Path) -> None:
     (image_folder(tmp_path) / "odom_car.csv").write_text("100.0,1,0\n101.0,1,0\n")
-    with pytest.raises(OdometryError, match=r"covers none of the frames .* one clock"):
+    with pytest.raises(OdometryError, match=r"covers none of the frames"):
         opened(tmp_path).odometry(1)
 
 
@@ -326,7 +326,7 @@ def test_every_table_gives_the_same_arc(tmp_path: Path, name: str, separator: st
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"time": TIMES, "speed": ONES}, "columns speed, time were understood; needed are time"),
+        ({"time": TIMES, "speed": ONES}, "columns speed, time were understood; name time"),
         ({"speed": ONES, "yaw_rate": ONES}, "no column is named time"),
         ({"time": 0 * TIMES, "v": ONES, "w": ONES}, "line 3: time 0.000000 s does not come after"),
         ({"time": TIMES, "v": ONES, "w": 30 * ONES}, "absurd .* are these degrees"),
