@@ -132,7 +132,9 @@ def _judged_grid(found: DenseMap, lab: RenderedLabSequence) -> list[tuple[Cell, 
     y = grid.origin[1] + (len(grid.cells) - row - 0.5) * grid.resolution_m
     stands = np.zeros(len(x), np.bool_)
     for height in _HEIGHTS_M:
-        points = np.stack([x, y, np.full_like(x, grid.floor_m + height)], 1) @ grid.wRg.T
+        points = (
+            np.stack([x, y, np.full_like(x, grid.ground[row, column] + height)], 1) @ grid.wRg.T
+        )
         stands |= _to_room(points, lab) < 0.5 * grid.resolution_m
     return [("free cells that are occupied, %", 100.0 * float(stands.mean()))]
 
@@ -163,7 +165,8 @@ def _thickness(found: DenseMap) -> float:
     grid, surface = found.grid, found.surface
     points = surface.positions @ grid.wRg
     level = surface.normals @ grid.wRg[:, 2] > 0.94
-    points = points[level & (np.abs(points[:, 2] - grid.floor_m) < 0.1)]
+    floor_m = float(np.median(grid.ground[grid.cells == FREE]))
+    points = points[level & (np.abs(points[:, 2] - floor_m) < 0.1)]
     cells = np.unique(np.floor(points[:, :2] / 0.6), axis=0, return_inverse=True)[1].ravel()
     spread = [points[cells == k, 2].std() for k in range(cells.max() + 1)]
     return 1000.0 * float(np.median(spread))

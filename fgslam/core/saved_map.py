@@ -46,6 +46,7 @@ class SavedMap:
         about: where it comes from: names, versions, the recording's identity (plain JSON values).
         evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending.
         patches: the landmarks' own; None where they were not carried.
+        colours: (n, 3) red, green, blue; None from grey images.
     """
 
     rig: CameraRig
@@ -60,9 +61,15 @@ class SavedMap:
     about: dict[str, Any]
     evidence: IntArray
     patches: LandmarkPatches | None = None
+    colours: ByteArray | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
+
+    @property
+    def shown(self) -> ByteArray:
+        """(n, 3) red, green, blue; its grey values where the images had no more."""
+        return np.repeat(self.colour[:, None], 3, axis=1) if self.colours is None else self.colours
 
 
 def _require_map(saved: SavedMap) -> None:
@@ -80,6 +87,7 @@ def _require_map(saved: SavedMap) -> None:
         ("farthest", saved.farthest, (n,)),
         ("permanent", saved.permanent, (n,)),
         ("colour", saved.colour, (n,)),
+        ("colours", saved.shown, (n, 3)),
         ("descriptors", views.descriptors, (v, 128)),
         ("sizes of views", views.size, (v,)),
         ("orientations of views", views.orientation, (v,)),

@@ -31,6 +31,8 @@ _COVARIANCE_NAMES = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 _UPPER = np.triu_indices(3)
 _INT32_MAX = 2**31 - 1
 _PLY_TYPES = {"f8": "double", "f4": "float", "i4": "int", "u1": "uchar"}
+_PCD_KINDS = {"f8": "f4", "f4": "f4", "i4": "u4", "u1": "u1"}
+_PCD_NAMES = {"red": "rgb", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
 _PLY_FORMAT = "format binary_little_endian 1.0"
 _PLY_COMMENTS = (
     "fgslam landmark map 1",
@@ -84,6 +86,8 @@ class MapPoints(Rows):
 def write_map(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
     """Writes a map in the format that the suffix names: `.ply` or `.pcd`.
 
+    A `.ply` has every property of every landmark exactly.
+
     Args:
         path: the file to write, atomically.
         points: the landmarks, in the axes of cameras.
@@ -94,11 +98,11 @@ def write_map(path: Path, points: MapPoints, remark: str = "", axes: Axes = "cam
         OutputError: the suffix is another one, a landmark is not finite, an id needs more than 31
             bits, or writing failed.
     """
-    writers = {".ply": write_ply, ".pcd": write_pcd}
-    writer = writers.get(path.suffix.lower())
-    if writer is None:
+    require_suffix(path, "map")
+    _require_finite(path, positions=points.positions, covariances=points.covariances)
+    if len(points) and (points.ids.min() < 0 or points.ids.max() > _INT32_MAX):
         raise OutputError(
-            f"cannot write {path}: unknown map format '{path.suffix}'; use .ply or .pcd"
+            f"cannot write {path}: landmark ids must lie in 0 .. {_INT32_MAX}; renumber them"
         )
     if axes == "ros":
         positions, normals = points.positions @ ROS_FROM_CAMERA.T, points.normals
@@ -108,16 +112,31 @@ def write_map(path: Path, points: MapPoints, remark: str = "", axes: Axes = "cam
             covariances=rotate_covariances(ROS_FROM_CAMERA, points.covariances),
             normals=None if normals is None else normals @ ROS_FROM_CAMERA.T,
         )
-    writer(path, points, remark, axes)
+    records = np.empty(len(points), _ply_type(points.normals is not None))
+    columns = [
+        *(*points.positions.T, *points.colours.T, points.ids, points.hits, points.misses),
+        *(*points.covariances[:, _UPPER[0], _UPPER[1]].T, points.valid, points.permanent),
+        *(() if points.normals is None else points.normals.T),
+    ]
+    for name, values in zip(records.dtype.names or (), columns, strict=True):
+        records[name] = values
+    comments = [*(line.format(AXES[axes]) for line in _PLY_COMMENTS), remark]
+    write_points(path, comments, vertex=records)
 
 
-def write_ply(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
-    """Writes a binary little-endian .ply with every property of every landmark, exactly."""
-    _require_finite(path, positions=points.positions, covariances=points.covariances)
-    columns = dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
-    records = _records(path, points, _ply_type(points.normals is not None), columns)
-    comments = [line.format(AXES[axes]) for line in _PLY_COMMENTS]
-    write_bytes(path, ply_bytes([*comments, remark], vertex=records))
+def require_suffix(path: Path, what: str, known: Sequence[str] = (".ply", ".pcd")) -> None:
+    """Raises OutputError unless the format is a known one."""
+    if path.suffix.lower() not in known:
+        raise OutputError(
+            f"cannot write {path}: unknown {what} format '{path.suffix}'; use {' or '.join(known)}"
+        )
+
+
+def write_points(path: Path, comments: Iterable[str], **elements: npt.NDArray[np.void]) -> None:
+    """Writes elements as `.ply`, or their ``vertex`` as `.pcd`. Raises OutputError."""
+    is_pcd = path.suffix.lower() == ".pcd"
+    given = pcd_bytes(comments, elements["vertex"]) if is_pcd else ply_bytes(comments, **elements)
+    write_bytes(path, given)
 
 
 def ply_bytes(comments: Iterable[str], **elements: npt.NDArray[np.void]) -> bytes:
@@ -130,7 +149,13 @@ def ply_bytes(comments: Iterable[str], **elements: npt.NDArray[np.void]) -> byte
 
 
 def _ply_type(has_normals: bool) -> np.dtype[Any]:
-    return _landmark_type("f8", "i4", ("red", "green", "blue"), "u1", "n" if has_normals else None)
+    """One landmark in a file."""
+    kinds = [
+        *(("<f8", "x y z"), ("u1", "red green blue"), ("<i4", "landmark_id hits misses")),
+        *(("<f8", " ".join(_COVARIANCE_NAMES)), ("u1", "valid permanent")),
+        ("<f4", "nx ny nz" if has_normals else ""),
+    ]
+    return np.dtype([(name, kind) for kind, names in kinds for name in names.split()])
 
 
 def _ply_properties(dtype: np.dtype[Any]) -> list[str]:
@@ -196,21 +221,18 @@ def read_ply(path: Path) -> MapPoints:
     )
 
 
-def write_pcd(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
-    """Writes a binary .pcd 0.7 (PCL, Open3D, CloudCompare).
+def pcd_bytes(comments: Iterable[str], points: npt.NDArray[np.void]) -> bytes:
+    """A binary .pcd 0.7 (PCL, Open3D, CloudCompare) of what a .ply calls its vertices.
 
     Single precision: PCL's point types are, and its tools do not know doubles as x, y, z.
     """
-    _require_finite(path, positions=points.positions, covariances=points.covariances)
-    normals = None if points.normals is None else "normal_"
-    dtype = _landmark_type("f4", "u4", ("rgb",), "u4", normals)
-    red, green, blue = points.colours.astype(np.uint32).T
-    records = _records(path, points, dtype, {"rgb": (red << 16) | (green << 8) | blue})
-    write_bytes(path, pcd_bytes([remark, f"axes of the world: {AXES[axes]}"], records))
-
-
-def pcd_bytes(comments: Iterable[str], records: npt.NDArray[np.void]) -> bytes:
-    """A binary .pcd 0.7 of these fields."""
+    red, green, blue = (points[name].astype(np.uint32) for name in ("red", "green", "blue"))
+    columns = {
+        _PCD_NAMES.get(name, name): points[name].astype(_PCD_KINDS[points.dtype[name].str[1:]])
+        for name in points.dtype.names or ()
+        if name not in ("green", "blue")
+    }
+    records = as_records(columns | {"rgb": (red << 16) | (green << 8) | blue})
     dtype = records.dtype
     kinds = [dtype[name] for name in dtype.names or ()]
     lines = [
@@ -230,39 +252,12 @@ def pcd_bytes(comments: Iterable[str], records: npt.NDArray[np.void]) -> bytes:
     return "\n".join(lines).encode("ascii") + records.tobytes()
 
 
-def _landmark_type(
-    real: str, whole: str, colours: Sequence[str], tint: str, normals: str | None
-) -> np.dtype[Any]:
-    """One landmark in a file, packed: kinds of its numbers, names of its colours and normals."""
-    return np.dtype(
-        [(name, f"<{real}") for name in "xyz"]
-        + [(name, f"<{tint}") for name in colours]
-        + [(name, f"<{whole}") for name in ("landmark_id", "hits", "misses")]
-        + [(name, f"<{real}") for name in _COVARIANCE_NAMES]
-        + [(name, "u1") for name in ("valid", "permanent")]
-        + [(f"{normals}{axis}", "<f4") for axis in "xyz" if normals is not None]
-    )
-
-
-def _records(
-    path: Path, points: MapPoints, dtype: np.dtype[Any], colours: Mapping[str, npt.NDArray[Any]]
-) -> npt.NDArray[np.void]:
-    """The landmarks as they stand in a file. Raises OutputError of an id that does not fit."""
-    if len(points) and (points.ids.min() < 0 or points.ids.max() > _INT32_MAX):
-        raise OutputError(
-            f"cannot write {path}: landmark ids must lie in 0 .. {_INT32_MAX}; renumber them"
-        )
-    columns = [
-        *points.positions.T,
-        *colours.values(),
-        *(points.ids, points.hits, points.misses),
-        *points.covariances[:, _UPPER[0], _UPPER[1]].T,
-        *(points.valid, points.permanent),
-        *(() if points.normals is None else points.normals.T),
-    ]
-    records = np.empty(len(points), dtype)
-    for name, values in zip(dtype.names or (), columns, strict=True):
-        records[name] = values
+def as_records(columns: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.void]:
+    """Rows of named columns (n,) or (n, k), packed, little-endian."""
+    kinds = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in columns.items()]
+    records = np.empty(len(next(iter(columns.values()))), np.dtype(kinds))
+    for name, column in columns.items():
+        records[name] = column
     return records
 
 

@@ -7,7 +7,6 @@ is carved away. docs/howto/dense_map.md.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +15,20 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, Image, IntArray
-from fgslam.core.errors import OutputError
 from fgslam.core.files import write_bytes, write_text
 from fgslam.core.geometry import inverse, skew
 from fgslam.core.open3d_library import load_open3d
-from fgslam.report.formats import AXES, ROS_FROM_CAMERA, Axes, pcd_bytes, ply_bytes
+from fgslam.report.formats import (
+    AXES,
+    ROS_FROM_CAMERA,
+    Axes,
+    as_records,
+    require_suffix,
+    write_points,
+)
 
 TRUNCATION_VOXELS = 4.0
 KEPT_SIGMA_VOXELS = 1.5
@@ -92,7 +98,10 @@ class Fusion:
         # In the camera's frame: a block's corner and its voxels' offsets.
         rotation = cTw[:3, :3].astype(np.float32) * np.float32(self.voxel_m)
         corners = blocks @ (_SIDE * rotation.T) + cTw[:3, 3].astype(np.float32)
-        x, y, z = (corners[:, None] + _OFFSETS @ rotation.T).reshape(-1, 3).T
+        x, y, z = (
+            np.add.outer(corner, offset).ravel()
+            for corner, offset in zip(corners.T, rotation @ _OFFSETS.T, strict=True)
+        )
         pixel = self._pixels(x, y, z, frame.depth.shape)
         use = np.flatnonzero(pixel >= 0)
         pixel, z = pixel[use], z[use]
@@ -101,31 +110,30 @@ class Fusion:
         near = (depth > 0.0) & (apart >= -self._truncation)
         use, pixel, z, apart = use[near], pixel[near], z[near], apart[near]
         sigma = frame.sigma.ravel()[pixel] * z * z
-        values = {
-            "tsdf": np.minimum(apart / self._truncation, np.float32(1.0))[:, None],
-            "color": frame.image.reshape(frame.depth.size, -1)[pixel].astype(np.float32),
-            "shared": frame.shared.ravel()[pixel, None],
-        }
+        tsdf = np.minimum(apart / self._truncation, np.float32(1.0))
         at = (rows[:, None] * _SIDE**3 + np.arange(_SIDE**3)).ravel()[use]
-        self._take_in(at, (1.0 / (sigma * sigma))[:, None], values)
+        share = self._take_in(at, 1.0 / (sigma * sigma), tsdf)
+        near = np.flatnonzero(tsdf < 1.0)  # what is seen through has no colour
+        at, pixel, share = at[near], pixel[near], share[near]
+        shared, colour = self._array("shared"), self._array("color")
+        shared[at] += share * (frame.shared.ravel()[pixel] - shared[at])
+        shown = frame.image.reshape(frame.depth.size, -1)[pixel]
+        colour[at] += share[:, None] * (shown - colour[at])
 
-    def _take_in(self, at: IntArray, weight: Float32, values: dict[str, Float32]) -> None:
-        """Weighted means (West 1979) of values at voxels (n,), each once."""
-        arrays = {name: self._array(name) for name in _ATTRIBUTES}
-        total = arrays["weight"][at] + weight
-        share = weight / total
-        for name, value in values.items():
-            before = arrays[name][at]
-            now = before + share * (value - before)
-            arrays[name][at] = now
-            if name == "tsdf":
-                arrays["scatter"][at] += weight * (value - before) * (value - now)
-        arrays["weight"][at] = total
-        arrays["count"][at] += 1.0
+    def _take_in(self, at: IntArray, weight: Float32, tsdf: Float32) -> Float32:
+        """Weighted means (West 1979) at voxels (n,), each once; the weights' shares in the sums."""
+        mean, total, scatter = map(self._array, ("tsdf", "weight", "scatter"))
+        before, weights = mean[at], total[at] + weight
+        share, change = weight / weights, tsdf - before
+        mean[at], total[at] = before + share * change, weights
+        scatter[at] += (weight - weight * share) * change * change
+        self._array("count")[at] += 1.0
+        return share
 
     def _array(self, name: str) -> Float32:
-        """(n, channels) of all voxels, to be written in place until blocks are added."""
-        return np.asarray(self._grid.attribute(name).numpy().reshape(-1, _ATTRIBUTES[name]))
+        """Of all voxels, (n,) or (n, 3), to be written in place until blocks are added."""
+        values = self._grid.attribute(name).numpy()
+        return np.asarray(values.reshape(-1, _ATTRIBUTES[name]).squeeze())
 
     def _rows(self, blocks: IntArray) -> IntArray:
         """(n,) where the attributes of blocks (n, 3) lie; -1 of those that are not there."""
@@ -136,11 +144,10 @@ class Fusion:
     def _pixels(self, x: Float32, y: Float32, z: Float32, shape: tuple[int, ...]) -> IntArray:
         """(n,) nearest pixels, counted row by row, of points in the camera's frame; -1 outside."""
         (fx, _, cx), (_, fy, cy) = self._matrix[:2].astype(np.float32)
-        ahead = np.maximum(z, np.float32(1e-3))
-        u = np.rint(fx * x / ahead + cx).astype(np.int32)
-        v = np.rint(fy * y / ahead + cy).astype(np.int32)
+        ahead = np.float32(1.0) / np.maximum(z, np.float32(1e-3))
+        u, v = np.rint(fx * x * ahead + cx), np.rint(fy * y * ahead + cy)
         inside = (z > 0.0) & (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
-        return np.where(inside, v * shape[1] + u, -1)
+        return np.where(inside, v * np.float32(shape[1]) + u, np.float32(-1.0)).astype(np.int32)
 
     def _before(self, frame: DepthFrame, cTw: FloatArray) -> BoolArray:
         """(n,) blocks that the frame sees through."""
@@ -177,8 +184,8 @@ class Fusion:
             triangles[np.lexsort(triangles.T)],
             np.ascontiguousarray(normals),
             np.rint(255.0 * colours).clip(0, 255).astype(np.uint8),
-            np.sqrt(1.0 / weight[at, 0]),
-            np.sqrt(self._array("shared")[at, 0]),
+            np.sqrt(1.0 / weight[at]),
+            np.sqrt(self._array("shared")[at]),
         )
 
 
@@ -225,7 +232,6 @@ class Surface:
         self, path: Path, triangles: bool = False, axes: Axes = "camera", remark: str = ""
     ) -> None:
         """Writes vertices as `.ply` or `.pcd`; a `.ply` also with triangles. OutputError."""
-        require_cloud_suffix(path, triangles)
         found = self.in_axes(axes)
         columns = {
             **dict(zip("xyz", found.positions.T, strict=True)),
@@ -234,54 +240,37 @@ class Surface:
             "sigma": found.sigmas,
             "voxel_sigma": found.voxel_sigmas,
         }
-        comments = ["fgslam dense map 1", f"axes of the world: {AXES[axes]}, metres", remark]
-        if path.suffix.lower() == ".pcd":
-            red, green, blue = (columns.pop(name).astype(np.uint32) for name in _COLOURS)
-            columns["rgb"] = (red << 16) | (green << 8) | blue
-            columns = {re.sub("^n([xyz])$", r"normal_\1", n): c for n, c in columns.items()}
-            write_bytes(path, pcd_bytes(comments, _as_records(columns)))
-            return
-        elements = {"vertex": _as_records(columns)}
+        elements = {"vertex": as_records(columns)}
         if triangles:
             corners = {"count": np.full(len(found.triangles), 3, np.uint8)}
-            elements["face"] = _as_records({**corners, "vertex_indices": found.triangles})
-        write_bytes(path, ply_bytes(comments, **elements))
+            elements["face"] = as_records({**corners, "vertex_indices": found.triangles})
+        comments = ["fgslam dense map 1", f"axes of the world: {AXES[axes]}, metres", remark]
+        require_suffix(path, *(MESH if triangles else CLOUD))
+        write_points(path, comments, **elements)
 
 
-_COLOURS = ("red", "green", "blue")
-
-
-def require_cloud_suffix(path: Path, triangles: bool = False) -> None:
-    """Raises OutputError unless the format can hold points, or triangles."""
-    known = (".ply",) if triangles else (".ply", ".pcd")
-    if path.suffix.lower() not in known:
-        what = "mesh" if triangles else "cloud"
-        raise OutputError(
-            f"cannot write {path}: unknown {what} format '{path.suffix}'; use {' or '.join(known)}"
-        )
-
-
-def _as_records(columns: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.void]:
-    """Rows of named columns (n,) or (n, k), packed, little-endian."""
-    kinds = [(name, c.dtype.newbyteorder("<"), c.shape[1:]) for name, c in columns.items()]
-    records = np.empty(len(next(iter(columns.values()))), np.dtype(kinds))
-    for name, column in columns.items():
-        records[name] = column
-    return records
-
+CLOUD = ("cloud", (".ply", ".pcd"))
+MESH = ("mesh", (".ply",))
+"""What a file is, and the formats that hold it."""
 
 # --------------------------------------------------------------------------------------------
 # A grid to drive by
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 """Grey values of Nav2's map server, as `trinary` reads them."""
-_OBSTACLE_M = (0.1, 2.0)  # heights above the floor; the higher one is Nav2's
+_OBSTACLE_M = (0.1, 2.0)  # heights above the ground; the higher one is Nav2's
 _POINTS = 2  # vertices and middles of triangles, from which on a cell is occupied
 _CROSSINGS = 3  # by scans, from which on a cell is free
 _NEAREST = 3  # obstacle of a column, counted from the camera: nearer ones may be wrong matches
 _TILTS_DEG = (40.0, 30.0, 20.0, 20.0, 10.0, 10.0)  # of the floor's normals, ever nearer
 _FEWEST, _NEAR_STEPS = 50, 2.0
 _FLOOR_SHARE = 0.25  # of the level that has most
+_SLOPE = 0.3  # of the ground, at most (Vosselman 2000)
+_GROUND_CELLS = 4  # of the grid along a cell in which the ground's height is found
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+_SQUARE = np.ones((3, 3), np.uint8)
+_NONE_M = np.float32(1e9)  # out of any cell's way
+_SPAN = 1 << 20  # of cells along y, as numbers of cells count them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,14 +282,14 @@ class Grid:
         resolution_m: side of a cell.
         origin: (x, y) of the corner of the last row's first cell, metres.
         wRg: (3, 3) from the grid's axes (x forward, y left, z up) to the map's (of cameras).
-        floor_m: height of the floor over the map's origin.
+        ground: (rows, columns) height of the ground along z.
     """
 
     cells: ByteArray
     resolution_m: float
     origin: tuple[float, float]
     wRg: FloatArray
-    floor_m: float
+    ground: Float32
 
     @property
     def tilt_deg(self) -> float:
@@ -322,37 +311,86 @@ class Grid:
         )
 
 
-def find_floor(
-    surface: Surface, up: FloatArray, known: bool, step_m: float
-) -> tuple[FloatArray, float]:
-    """Direction up (3,) and height of the floor: the lowest large level of the surface.
+def find_up(surface: Surface, up: FloatArray, step_m: float) -> FloatArray:
+    """Upward direction (3,) of the floor: of the lowest large level of the surface.
 
     Args:
         surface: of the drive.
-        up: (3,) unit vector of the cameras' mean upward direction, or of the body's.
-        known: the body states it; else the level surfaces around it do.
+        up: (3,) unit vector of the cameras' mean upward direction.
         step_m: between levels.
     """
     positions = surface.positions.astype(np.float64)
-    floor_m = float(np.min(positions @ up, initial=0.0))
-    for tilt_deg in (20.0,) if known else _TILTS_DEG:
+    for tilt_deg in _TILTS_DEG:
         level = positions[surface.normals @ up > np.cos(np.deg2rad(tilt_deg))]
         if len(level) < _FEWEST:
-            return up, floor_m
+            return up
         heights = level @ up
         edges = np.arange(heights.min() - step_m, heights.max() + 2.0 * step_m, step_m)
         counts = np.histogram(heights, edges)[0]
         first = int(np.argmax(counts >= _FLOOR_SHARE * counts.max()))
         first += int(np.argmax(counts[first : first + 3]))  # the level's middle
-        near = np.abs(heights - edges[first : first + 2].mean()) < _NEAR_STEPS * step_m
-        floor_m = float(np.median(heights[near]))
-        if not known:
-            normal = np.linalg.svd(level[near] - level[near].mean(axis=0), full_matrices=False)[2][
-                2
-            ]
-            up = normal * np.sign(normal @ up)
-            floor_m = float(np.median(level[near] @ up))
-    return up, floor_m
+        near = level[np.abs(heights - edges[first : first + 2].mean()) < _NEAR_STEPS * step_m]
+        normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
+        up = normal * np.sign(normal @ up)
+    return up
+
+
+class Ground:
+    """Height of the ground, which may slope and roll: the lowest level that a slope limit allows.
+
+    Of each cell the mean of level vertices; where the cameras kept to one height above it, as on
+    wheels, the ground below them too. What lies higher than the slope limit allows above
+    any other cell stands on the ground (Vosselman 2000, slope-based filtering).
+    """
+
+    def __init__(
+        self, points: FloatArray, upwards: FloatArray, cameras: FloatArray, cell_m: float
+    ) -> None:
+        """Finds it.
+
+        Args:
+            points: (n, 3) vertices, z up.
+            upwards: (n,) of their normals.
+            cameras: (k, 3) where the cameras were.
+            cell_m: side of a cell.
+        """
+        self._cell_m = cell_m
+        level = points[upwards > np.cos(np.deg2rad(_TILTS_DEG[0]))]
+        seen = np.floor(level[:, :2] / cell_m).astype(np.int64)
+        path = np.floor(cameras[:, :2] / cell_m).astype(np.int64)
+        every = np.concatenate([path, seen])
+        self._low = every.min(axis=0)
+        cells = tuple((seen - self._low).T)
+        total, count = np.zeros((2, *(every.max(axis=0) - self._low + 1)), np.float32)
+        np.add.at(total, cells, level[:, 2])
+        np.add.at(count, cells, 1.0)
+        known = np.where(count > 0.0, total / np.maximum(count, 1.0), np.float32(np.nan))
+        below = tuple((path - self._low).T)
+        height = cameras[:, 2] - known[below]
+        height = height[np.isfinite(height)]
+        if len(height) and np.median(np.abs(height - np.median(height))) < _OBSTACLE_M[0]:
+            known[below] = cameras[:, 2] - np.median(height)
+        if np.isnan(known).all():
+            known[:] = np.min(points[:, 2], initial=0.0)
+        missing = np.isnan(known)
+        # Closed: what lies below all its neighbours is a wrong match.
+        most = cv2.dilate(np.where(missing, -_NONE_M, known), _SQUARE)
+        ground = cv2.erode(np.where(most > -_NONE_M, most, _NONE_M), _SQUARE)
+        rise = np.float32(_SLOPE * cell_m)
+        for _ in range(max(ground.shape)):
+            ways = cv2.erode(ground, _CROSS) + rise, cv2.erode(ground, _SQUARE) + 1.4142 * rise
+            ground = np.minimum(ground, np.minimum(*ways))
+        nearest = ndimage.distance_transform_edt(
+            missing, return_distances=False, return_indices=True
+        )
+        self._heights = cv2.blur(ground[tuple(nearest)], (3, 3))
+
+    def at(self, places: FloatArray) -> Float32:
+        """Heights (...,) at places (..., 2), of the nearest cell."""
+        cells = np.floor(places / self._cell_m).astype(np.int64) - self._low
+        rows, columns = self._heights.shape
+        x, y = cells[..., 0].clip(0, rows - 1), cells[..., 1].clip(0, columns - 1)
+        return np.asarray(self._heights[x, y])
 
 
 def make_grid(
@@ -360,10 +398,9 @@ def make_grid(
     scans: Sequence[tuple[npt.NDArray[Any], FloatArray]],
     rays: Float32,
     up: FloatArray,
-    floor_m: float,
     resolution_m: float,
 ) -> Grid:
-    """Cells where the surface stands above the floor are occupied; free are those seen across.
+    """Cells where the surface stands above the ground are occupied; free are those seen across.
 
     Args:
         surface: of the drive: what it has carved away was there for some time only.
@@ -371,19 +408,24 @@ def make_grid(
             camera's pose (4, 4).
         rays: (r, c, 3) of depth one.
         up: (3,) unit vector in the map.
-        floor_m: height of the floor along it.
         resolution_m: side of a cell.
     """
     wRg, heights = _level_axes(up), (max(_OBSTACLE_M[0], 2.0 * resolution_m), _OBSTACLE_M[1])
-    middles = surface.positions[surface.triangles].mean(axis=1)
-    points = np.concatenate([surface.positions, middles]) @ wRg
-    points = points[(points[:, 2] > floor_m + heights[0]) & (points[:, 2] < floor_m + heights[1])]
-    occupied = _often(np.floor(points[:, :2] / resolution_m), _POINTS)
+    poses = [wRg.T @ wTc[:3] for _, wTc in scans]
+    vertices = surface.positions @ wRg
+    ground = Ground(
+        vertices,
+        surface.normals @ up,
+        np.array([gTc[:, 3] for gTc in poses]),
+        _GROUND_CELLS * resolution_m,
+    )
+    points = np.concatenate([vertices, vertices[surface.triangles].mean(axis=1)])
+    above = points[:, 2] - ground.at(points[:, :2])
+    points = points[(above > heights[0]) & (above < heights[1])]
+    occupied = _often(_numbers(np.floor(points[:, :2] / resolution_m)), _POINTS)
     crossed = [
-        _crossed(
-            np.float64(rays) * depth[..., None], wRg.T @ wTc[:3], floor_m, heights, resolution_m
-        )
-        for depth, wTc in scans
+        _crossed(np.float64(rays) * depth[..., None], gTc, ground, heights, resolution_m)
+        for (depth, _), gTc in zip(scans, poses, strict=True)
     ]
     free = _often(np.concatenate(crossed), _CROSSINGS)
     everything = np.concatenate([np.zeros((1, 2), np.int64), free, occupied])
@@ -392,46 +434,57 @@ def make_grid(
     cells[tuple((free - low).T)] = FREE
     cells[tuple((occupied - low).T)] = OCCUPIED
     # Surfaces are known to a cell or so: what is next to an obstacle is not known to be free.
-    near = cv2.dilate((cells == OCCUPIED).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    near = cv2.dilate((cells == OCCUPIED).astype(np.uint8), _SQUARE) > 0
     cells[near & (cells == FREE)] = UNKNOWN
+    places = (np.moveaxis(np.indices(cells.shape), 0, -1) + low + 0.5) * resolution_m
+    cells, below = (np.ascontiguousarray(a.T[::-1]) for a in (cells, ground.at(places)))
     x, y = (low * resolution_m).tolist()
-    return Grid(np.ascontiguousarray(cells.T[::-1]), resolution_m, (x, y), wRg, floor_m)
+    return Grid(cells, resolution_m, (x, y), wRg, below)
 
 
-def _often(cells: FloatArray, times: int) -> IntArray:
-    """Those of cells (n, 2) that are there so many times."""
-    found, count = np.unique(cells.astype(np.int64), axis=0, return_counts=True)
-    return found[count >= times]
+def _numbers(cells: npt.NDArray[Any]) -> IntArray:
+    """One number for each of cells (n, 2)."""
+    x, y = cells.astype(np.int64).T
+    return np.asarray(x * _SPAN + y + _SPAN // 2)
+
+
+def _often(numbers: IntArray, times: int) -> IntArray:
+    """Cells (n, 2) that are there so many times."""
+    found, count = np.unique(numbers, return_counts=True)
+    x, y = np.divmod(found[count >= times], _SPAN)
+    return np.stack([x, y - _SPAN // 2], axis=1)
 
 
 def _crossed(
     points: FloatArray,
     gTc: FloatArray,
-    floor_m: float,
+    ground: Ground,
     heights: tuple[float, float],
     resolution_m: float,
-) -> FloatArray:
-    """Cells (n, 2) that a scan sees across: of each column to the farthest floor before obstacles.
+) -> IntArray:
+    """Numbers of cells that a scan sees across: of each column to the last ground before obstacles.
 
     Args:
         points: (r, c, 3) in the camera's frame, zero where there is none.
         gTc: (3, 4) pose of the camera in the grid's axes.
-        floor_m: height of the floor.
+        ground: below all of it.
         heights: lowest and highest above it of an obstacle.
         resolution_m: side of a cell.
     """
     ahead = points @ gTc[:, :3].T
-    height, way = ahead[..., 2] + gTc[2, 3] - floor_m, np.hypot(ahead[..., 0], ahead[..., 1])
+    height = ahead[..., 2] + gTc[2, 3] - ground.at(ahead[..., :2] + gTc[:2, 3])
+    way = np.hypot(ahead[..., 0], ahead[..., 1])
     known = points[..., 2] > 0.0
     blocked = np.where(known & (height > heights[0]) & (height < heights[1]), way, np.inf)
-    blocked = np.sort(blocked, axis=0)[min(_NEAREST, len(way)) - 1]
+    nth = min(_NEAREST, len(way)) - 1
+    blocked = np.partition(blocked, nth, axis=0)[nth]
     floor = known & (np.abs(height) <= heights[0]) & (way < blocked)
     far = np.where(floor, way, np.where(way == blocked, way - resolution_m, 0.0))
     at = far.argmax(axis=0), np.arange(far.shape[1])
     unit = ahead[at][:, :2] / np.maximum(way[at], resolution_m)[:, None]
     along = np.minimum(np.arange(0.0, far.max(), 0.5 * resolution_m), far[at][:, None])
     places = gTc[:2, 3] + along[..., None] * unit[:, None]
-    return np.unique(np.floor(places.reshape(-1, 2) / resolution_m), axis=0)
+    return np.unique(_numbers(np.floor(places.reshape(-1, 2) / resolution_m)))
 
 
 def _level_axes(up: FloatArray) -> FloatArray:

@@ -13,11 +13,14 @@ import numpy.typing as npt
 from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.correction import EXPECTED_PX, FIELD_PX, SHARED, shared_information
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
-from fgslam.core.log import MeasurementLog
-from fgslam.core.sensors import CameraRig, body_is_camera
-from fgslam.core.types import Estimate
+from fgslam.core.log import ImageSequence, MeasurementLog
+from fgslam.core.sensors import CameraRig, body_is_camera, vertical_of
+from fgslam.core.types import Estimate, Trajectory
 from fgslam.datasets.depth import DEPTH_SIGMA_M
 from fgslam.datasets.images import Depth
+from fgslam.datasets.odometry import STAMP_TOLERANCE_S
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.times import rows_at
 from fgslam.frontend.dense_stereo import MIN_DISPARITY_PX, DenseStereo
 from fgslam.report.surface import (
     KEPT_SIGMA_VOXELS,
@@ -26,7 +29,7 @@ from fgslam.report.surface import (
     Fusion,
     Grid,
     Surface,
-    find_floor,
+    find_up,
     make_grid,
 )
 from fgslam.runs.units import Progress
@@ -88,8 +91,7 @@ class DenseMap:
         frames: how many depth images were fused.
         scans: of each every second row and column, metres, and the pose (4, 4) of its camera.
         rays: (r, c, 3) of theirs, of depth one.
-        up: (3,) mean upward direction of the body or the camera, in the map.
-        level: whether it is that of a body that keeps to it, as on wheels.
+        up: (3,) upward direction in the map: of a body that keeps to it, else of the floor.
     """
 
     surface: Surface
@@ -99,13 +101,11 @@ class DenseMap:
     scans: tuple[tuple[Float16, FloatArray], ...]
     rays: Float32
     up: FloatArray
-    level: bool
 
     @cached_property
     def grid(self) -> Grid:
         """Free, occupied and unknown cells of the floor."""
-        up, floor = find_floor(self.surface, self.up, self.level, 2.0 * self.voxel_m)
-        return make_grid(self.surface, self.scans, self.rays, up, floor, self.voxel_m)
+        return make_grid(self.surface, self.scans, self.rays, self.up, self.voxel_m)
 
 
 Measured: TypeAlias = Callable[[int], tuple[Depth, Float32, Image]]
@@ -214,13 +214,30 @@ def fuse(
             f"nothing was seen as well as {100.0 * kept:.3g} cm within "
             f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g}) or a larger --range"
         )
-    mounted = not body_is_camera(rig.bTc)
-    cUp = rig.bTc[2, :3] if mounted else np.array([0.0, -1.0, 0.0])
-    up = (estimate.trajectory.poses[:, :3, :3] @ cUp).mean(axis=0)
-    # What keeps to its vertical is on wheels.
+    up = (estimate.trajectory.poses[:, :3, :3] @ vertical_of(rig.bTc)).mean(axis=0)
     length = float(np.linalg.norm(up))
-    level = mounted and length > _LEVEL
-    return DenseMap(surface, voxel, most, len(scans), tuple(scans), _rays(rig), up / length, level)
+    up = up / length
+    if body_is_camera(rig.bTc) or length < _LEVEL:  # what keeps to its vertical is on wheels
+        up = find_up(surface, up, 2.0 * voxel)
+    return DenseMap(surface, voxel, most, len(scans), tuple(scans), _rays(rig), up)
+
+
+def rows_along(
+    trajectory: Trajectory, stamps: FloatArray, name: str = "this recording"
+) -> list[int]:
+    """Frame of a recording for each pose. Raises DatasetError where it is another recording."""
+    rows = rows_at(stamps, trajectory.timestamps, STAMP_TOLERANCE_S)
+    if (rows < 0).any():
+        raise DatasetError(f"{name} has other times than the run; give the run's own recording")
+    return [int(row) for row in rows]
+
+
+def readers_of(sequence: ImageSequence) -> tuple[Pictures, Callable[[int], Depth] | None]:
+    """Images of a recording's frames, and their depth where a camera gives it."""
+    if not isinstance(sequence, Recording):
+        return lambda i: sequence.frame(i).images, None
+    load, numbers = sequence.load_depth, sequence.indices.tolist()
+    return sequence.colour, None if load is None else lambda i: load(numbers[i])
 
 
 def _readable(read: Callable[[int], _Read], rows: Sequence[int]) -> list[_Read]:

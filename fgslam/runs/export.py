@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, OutputError
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
-from fgslam.core.log import MeasurementLog
+from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.sensors import (
     CAMERA_NAMES,
@@ -27,10 +27,8 @@ from fgslam.core.sensors import (
 from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory, read_covariances
 from fgslam.datasets.images import Depth, encoded_png
 from fgslam.datasets.layouts import is_recording
-from fgslam.datasets.odometry import STAMP_TOLERANCE_S
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
-from fgslam.datasets.times import rows_at
 from fgslam.report.content import read_metrics
 from fgslam.report.formats import (
     MCAP_SUFFIX,
@@ -40,14 +38,15 @@ from fgslam.report.formats import (
     PoseLandmarkGraph,
     read_ply,
     require_graph_suffix,
+    require_suffix,
     write_colmap,
     write_g2o,
     write_map,
     write_trajectory,
 )
-from fgslam.report.surface import FREE, OCCUPIED, require_cloud_suffix
+from fgslam.report.surface import CLOUD, FREE, MESH, OCCUPIED
 from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
-from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse
+from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse, readers_of, rows_along
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
@@ -160,7 +159,7 @@ def export_run(
         bare = folder is not None and wanted.trajectory.suffix.lower() == ".kitti"
         lines.append(saved_as + (line_numbers(trajectory, log()) if bare else ""))
     if wanted.is_dense:
-        found = dense_map(run, wanted.estimator, wanted.how, wanted.recording, progress)
+        found = dense_map(run, wanted.estimator, wanted.how, wanted.recording, progress, log())
         lines += save_dense(found, wanted, remark)
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines
@@ -192,18 +191,20 @@ def dense_map(
     how: DenseSettings | None = None,
     recording: Path | None = None,
     progress: Progress = lambda what, done, total: None,
+    log: MeasurementLog | None = None,
 ) -> DenseMap:
-    """The dense map of a run, from its recording's images.
+    """The dense map of a run, from its recording's images; ``log`` is its own, if at hand.
 
     Raises:
         FgslamError: no run of SLAM, its recording is gone or has no images, or they show no depth.
     """
-    folder, log = run / results_folder(run, estimator), MeasurementLog.load(log_of(run))
+    folder = run / results_folder(run, estimator)
+    log = MeasurementLog.load(log_of(run)) if log is None else log
     trajectory = Trajectory.load(folder / "final.tum")
     covariances = read_covariances(folder / "covariance.csv")[1]
     estimate = Estimate(trajectory, covariances, NO_LANDMARKS).of("right", log.rig)
     rows, pictures, depths = frames_of(config_of(run, recording), estimate.trajectory)
-    return fuse(log, estimate, rows.tolist(), pictures, depths, how, progress)
+    return fuse(log, estimate, rows, pictures, depths, how, progress)
 
 
 def _require_outputs(run: Path, wanted: Wanted) -> None:
@@ -221,9 +222,9 @@ def _require_outputs(run: Path, wanted: Wanted) -> None:
     if wanted.graph is not None and not run.is_file():
         require_graph_suffix(wanted.graph)
     if wanted.dense is not None:
-        require_cloud_suffix(wanted.dense)
+        require_suffix(wanted.dense, *CLOUD)
     if wanted.mesh is not None:
-        require_cloud_suffix(wanted.mesh, triangles=True)
+        require_suffix(wanted.mesh, *MESH)
     if wanted.grid is not None and wanted.grid.suffix.lower() not in (".yaml", ".yml"):
         raise OutputError(
             f"cannot write {wanted.grid}: a grid is a .yaml with a .pgm next to it; give "
@@ -492,7 +493,7 @@ def export_images(
     rows, pictures, _ = frames_of(config, trajectory)
     model = build_model(log, trajectory, points)
     tints, missing = Tints(len(model.ids)), 0
-    for k, row in enumerate(rows.tolist()):
+    for k, row in enumerate(rows):
         try:
             shown = pictures(row)
         except FrameError:
@@ -571,36 +572,27 @@ def rows_of_frames(log: MeasurementLog, trajectory: Trajectory) -> IntArray:
 
 def frames_of(
     config: ExperimentConfig, trajectory: Trajectory
-) -> tuple[IntArray, Pictures, Callable[[int], Depth] | None]:
+) -> tuple[list[int], Pictures, Callable[[int], Depth] | None]:
     """Frame of the recording for each pose, its images, and its depth where a camera gives it.
 
     Raises:
         FgslamError: the run has no images, or its recording is gone or another one.
     """
-    dataset, depths = config.dataset, None
+    dataset = config.dataset
     if isinstance(dataset, MeasurementDatasetSettings):
         raise DatasetError(f"a recording of kind {dataset.kind} has no images to export")
     if isinstance(dataset, RenderedLabSettings):
-        sequence = open_sequence(config)
-        stamps, pictures = sequence.timestamps, lambda i: sequence.frame(i).images
+        sequence: ImageSequence = open_sequence(config)
+    elif is_recording(Path(dataset.path)):
+        sequence = open_recording(dataset)
     else:
-        if not is_recording(Path(dataset.path)):
-            raise DatasetError(
-                f"{dataset.path}: the run's recording is not there any more; say where it is now: "
-                "--recording PATH"
-            )
-        recording = open_recording(dataset)
-        stamps, pictures = recording.timestamps, recording.colour
-        if (load := recording.load_depth) is not None:
-            numbers = recording.indices.tolist()
-            depths = lambda i: load(numbers[i])  # noqa: E731
-    rows = rows_at(stamps, trajectory.timestamps, STAMP_TOLERANCE_S)
-    if (rows < 0).any():
         raise DatasetError(
-            f"the recording {dataset.path if hasattr(dataset, 'path') else dataset.kind} has other "
-            "times than the run; give the run's own recording"
+            f"{dataset.path}: the run's recording is not there any more; say where it is now: "
+            "--recording PATH"
         )
-    return rows, pictures, depths
+    name = dataset.path if hasattr(dataset, "path") else dataset.kind
+    rows = rows_along(trajectory, sequence.timestamps, f"the recording {name}")
+    return rows, *readers_of(sequence)
 
 
 class Tints:

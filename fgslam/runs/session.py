@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,10 @@ from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core import __version__
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.checks import require_flag, require_seed
-from fgslam.core.errors import ConfigError, MapError, OutputError
+from fgslam.core.errors import ConfigError, FrameError, MapError, OutputError
 from fgslam.core.files import as_path, require_output
 from fgslam.core.geometry import so3_log
-from fgslam.core.log import Frame
+from fgslam.core.log import Frame, MeasurementLog
 from fgslam.core.open3d_library import load_open3d
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
@@ -52,6 +52,9 @@ from fgslam.slam.results import SessionResult, Step
 from fgslam.slam.rig_memory import RigMemory
 from fgslam.slam.session import Images, Session, checked_images
 from fgslam.slam.settings import MapSettings
+
+if TYPE_CHECKING:
+    from fgslam.runs.dense import DenseMap
 
 # ------------------------------------------------------------------------------------------
 # Maps for other tools and later days: point clouds, map files, and finding oneself in one
@@ -91,7 +94,7 @@ class Map:
     def save(self, path: str | Path, axes: Axes = "camera") -> None:
         """Writes the map in the format that the suffix names.
 
-        `.fgmap` holds all of it but colours, for :meth:`load`; `.ply` and `.pcd` are point clouds
+        `.fgmap` holds all of it, for :meth:`load`; `.ply` and `.pcd` are point clouds
         for other tools, in the world: x right, y down, z forward, or with ``axes="ros"`` x forward,
         y left, z up; metres. The same map gives the same bytes; a file is written whole or not at
         all.
@@ -274,9 +277,9 @@ def valid_of(saved: SavedMap) -> BoolArray:
 
 def points_of(saved: SavedMap) -> MapPoints:
     """The landmarks of a map file as a point cloud."""
-    landmarks, colours = saved.landmarks, np.repeat(saved.colour[:, None], 3, axis=1)
-    geometry = (landmarks.ids, landmarks.positions, landmarks.covariances)
-    return MapPoints(*geometry, colours, saved.hits, saved.misses, valid_of(saved), saved.permanent)
+    landmarks = saved.landmarks
+    geometry = (landmarks.ids, landmarks.positions, landmarks.covariances, saved.shown)
+    return MapPoints(*geometry, saved.hits, saved.misses, valid_of(saved), saved.permanent)
 
 
 # --------------------------------------------------------------------------------------------
@@ -357,15 +360,48 @@ class Result(SessionResult):
         closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
         map: landmarks with covariances and appearance, to save or to find oneself in.
+        log: the session's measurements; it grows where tracking goes on.
+        cameras: the session's.
     """
 
     notes: tuple[str, ...]
     map: Map
+    log: MeasurementLog
+    cameras: CameraRig
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the images, and on what the estimator left out or had to repair."""
         return (*self.notes, *self.estimate.remarks)
+
+    def dense_map(self, frames: Any, **how: Any) -> DenseMap:
+        """All that images show along this trajectory: ``surface``, and ``grid`` to drive by.
+
+        Args:
+            frames: those that were tracked: a recording as :func:`fgslam.open_recording` gives it,
+                with its colours and its depth; or a sequence of (time, images, ...), the images as
+                for :meth:`Slam.track`. They are read again.
+            how: ``voxel_m``, ``range_m``, ``cameras``, ``every``, ``sigma_m`` of
+                :class:`fgslam.runs.dense.DenseSettings`.
+
+        Raises:
+            FgslamError: the frames have other times or no images, or they show no depth.
+        """
+        # These load OpenCV and much of SciPy.
+        from fgslam.runs.dense import DenseSettings, fuse, readers_of, rows_along
+
+        def images(i: int) -> tuple[Image, ...]:
+            if (given := frames[i][1]) is None:
+                raise FrameError(f"frame {i} has no images")
+            left, right, *top = (_eight_bits(image) for image in given)
+            raw = (right, left, *top)
+            return self.cameras.rectified(raw) if isinstance(self.cameras, StereoRig) else raw
+
+        sequence = getattr(frames, "sequence", None)
+        readers = (images, None) if sequence is None else readers_of(sequence)
+        stamps = [frame[0] for frame in frames] if sequence is None else sequence.timestamps
+        rows = rows_along(self.trajectory, np.asarray(stamps, np.float64))
+        return fuse(self.log, self.estimate, rows, *readers, DenseSettings(**how))
 
 
 class Slam(Session):
@@ -442,7 +478,11 @@ class Slam(Session):
                 "map of a result"
             )
         self._before = None if start_map is None else start_map.saved
-        self._colours: dict[int, ByteArray] = {}  # of landmarks that images in colour began
+        # Of landmarks that images in colour began.
+        self._colours: dict[int, ByteArray] = {}
+        if self._before is not None and self._before.colours is not None:
+            ids = self._before.landmarks.ids.tolist()
+            self._colours = dict(zip(ids, self._before.colours, strict=True))
         super().__init__(
             rig,
             estimator,
@@ -531,9 +571,13 @@ class Slam(Session):
             points.colours[row] = self._colours.get(identity, points.colours[row])
         drive = {"remark": self._remark, "remarks": list(map(sentence, found.remarks))}
         saved = map_of(self, found.estimate, self._before, name="session", **drive)
+        if self._colours:
+            rows = np.searchsorted(points.ids, saved.landmarks.ids)
+            saved = replace(saved, colours=points.colours[rows])
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         values["notes"] = tuple(map(sentence, found.notes))
-        return Result(**values, map=Map(saved, points, self._remark))
+        log = self.recorder.log
+        return Result(**values, map=Map(saved, points, self._remark), log=log, cameras=self.rig)
 
 
 _CHANNELS = ((3,), (4,))  # of images in colour

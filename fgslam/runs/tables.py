@@ -23,7 +23,7 @@ from fgslam.core.sensors import PoseFrame
 from fgslam.core.types import LAGS, Estimate, LandmarkMap, Trajectory, write_covariances
 from fgslam.evaluation.statistics import value_at
 from fgslam.report.content import Column, TextTable, write_csv
-from fgslam.report.formats import MapPoints, write_ply
+from fgslam.report.formats import MapPoints, write_map
 from fgslam.slam.pipeline import FrameNoise
 from fgslam.slam.replay import Replay, ReplayRow
 
@@ -50,7 +50,7 @@ def write_estimate(
     estimate.trajectory.save(folder / "final.tum", remark)
     covariances = estimate.covariances
     write_covariances(folder / "covariance.csv", estimate.trajectory, covariances, remark)
-    write_ply(folder / "map.ply", points, remark)
+    write_map(folder / "map.ply", points, remark)
 
 
 def write_replay(

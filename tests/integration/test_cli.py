@@ -202,7 +202,7 @@ def test_export_of_the_map(
     count = len(read_ply(finished.folder / KIND / "map.ply"))
     assert main(monkeypatch, "export", finished.folder, "--map", file) == 0
     assert capfd.readouterr().out == f"{file}: {count} landmarks\n"
-    head = file.read_bytes()[:400]
+    head = file.read_bytes()[:600]
     expected = {
         "ply": f"element vertex {count}\n",
         "pcd": f"POINTS {count}\n",

@@ -379,6 +379,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
     mine, yours = alignment.pairs[:, 0], alignment.pairs[:, 1]
     rest = np.setdiff1d(np.arange(len(b)), yours)
     first = int(a.landmarks.ids[-1]) + 1 if len(a) else 0
+    grey = a.colours is None and b.colours is None
     names = np.empty(len(b), np.int64)
     names[yours], names[rest] = a.landmarks.ids[mine], first + np.arange(len(rest))
     return SavedMap(
@@ -394,6 +395,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         about={"drives": [*a.about.get("drives", ()), *b.about.get("drives", ())]},
         evidence=np.union1d(a.evidence, b.evidence),
         patches=_patches(a, b, alignment.pairs, rest),
+        colours=None if grey else np.concatenate([a.shown, b.shown[rest]]),
     )
 
 

@@ -38,8 +38,6 @@ from fgslam.report.formats import (
     write_g2o,
     write_map,
     write_mcap,
-    write_pcd,
-    write_ply,
     write_trajectory,
 )
 from fgslam.runs.export import Tints, build_graph, build_model, with_normals
@@ -76,7 +74,7 @@ def open3d():
 
 def test_ply_there_and_back_is_exact(tmp_path: Path) -> None:
     written = a_map()
-    write_ply(tmp_path / "map.ply", written)
+    write_map(tmp_path / "map.ply", written)
     read = read_ply(tmp_path / "map.ply")
     for field in dataclasses.fields(MapPoints):
         if field.name != "covariances":
@@ -89,7 +87,7 @@ def test_ply_there_and_back_is_exact(tmp_path: Path) -> None:
 
 
 def test_ply_header_names_every_property(tmp_path: Path) -> None:
-    write_ply(tmp_path / "map.ply", a_map(3))
+    write_map(tmp_path / "map.ply", a_map(3))
     header = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")[0].decode()
     names = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
     expected = (
@@ -109,7 +107,7 @@ def test_same_map_same_bytes(tmp_path: Path, suffix: str) -> None:
 
 def test_open3d_reads_the_ply(tmp_path: Path, open3d) -> None:
     points = a_map()
-    write_ply(tmp_path / "map.ply", points)
+    write_map(tmp_path / "map.ply", points)
     cloud = open3d.io.read_point_cloud(str(tmp_path / "map.ply"))
     np.testing.assert_array_equal(np.asarray(cloud.points), points.positions)
     np.testing.assert_allclose(np.asarray(cloud.colors), points.colours / 255.0)
@@ -120,7 +118,7 @@ def test_open3d_reads_the_ply(tmp_path: Path, open3d) -> None:
 
 def test_open3d_reads_the_pcd(tmp_path: Path, open3d) -> None:
     points = a_map()
-    write_pcd(tmp_path / "map.pcd", points)
+    write_map(tmp_path / "map.pcd", points)
     cloud = open3d.io.read_point_cloud(str(tmp_path / "map.pcd"))
     np.testing.assert_array_equal(np.asarray(cloud.points), points.positions.astype(np.float32))
     np.testing.assert_allclose(np.asarray(cloud.colors), points.colours / 255.0)
@@ -145,7 +143,7 @@ def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
     path.write_text("OFF\n")
     with pytest.raises(DatasetError, match=r"not a \.ply"):
         read_ply(path)
-    write_ply(path, a_map(5))
+    write_map(path, a_map(5))
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
     with pytest.raises(DatasetError, match="cut off"):

@@ -20,7 +20,7 @@ from fgslam.report.surface import (
     Fusion,
     Grid,
     Surface,
-    find_floor,
+    find_up,
     make_grid,
 )
 
@@ -160,22 +160,25 @@ def grid_of(wTc: FloatArray, post: bool = False, level: bool = False) -> Grid:
         frames.append(DepthFrame(seen.depth, seen.sigma, seen.image, wTc @ turn, seen.shared))
     surface = fused(frames)
     up = np.array([0.0, -1.0, 0.0]) if not level else wTc[:3, :3] @ [0.0, -1.0, 0.0]
-    up, floor = find_floor(surface, up, level, 2.0 * VOXEL)
-    return make_grid(surface, [(f.depth, f.wTc) for f in frames], RAYS, up, floor, VOXEL)
+    up = up if level else find_up(surface, up, 2.0 * VOXEL)
+    return make_grid(surface, [(f.depth, f.wTc) for f in frames], RAYS, up, VOXEL)
+
+
+def cell_at(grid: Grid, x: float, y: float) -> tuple[int, int]:
+    """Row and column at x metres ahead and y to the left of the first camera."""
+    column = int((x - grid.origin[0]) / grid.resolution_m)
+    return len(grid.cells) - 1 - int((y - grid.origin[1]) / grid.resolution_m), column
 
 
 def cell(grid: Grid, x: float, y: float) -> int:
-    """At x metres ahead and y to the left of the first camera."""
-    column = int((x - grid.origin[0]) / grid.resolution_m)
-    row = len(grid.cells) - 1 - int((y - grid.origin[1]) / grid.resolution_m)
-    return int(grid.cells[row, column])
+    return int(grid.cells[cell_at(grid, x, y)])
 
 
 @pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize("level", [True, False])
 def test_floor_is_free_obstacles_are_occupied_and_the_hidden_is_unknown(level: bool) -> None:
     grid = grid_of(np.eye(4), post=True, level=level)
-    assert grid.floor_m == pytest.approx(-FLOOR_M, abs=0.02)
+    assert np.median(grid.ground[grid.cells == FREE]) == pytest.approx(-FLOOR_M, abs=0.02)
     assert grid.tilt_deg < 1.0
     assert cell(grid, 0.5, 0.0) == FREE
     assert cell(grid, 1.4, 0.5) == FREE
@@ -190,6 +193,43 @@ def test_the_floor_is_found_in_a_map_that_is_tilted() -> None:
     grid = grid_of(inverse(tilted))
     assert grid.tilt_deg == pytest.approx(15.0, abs=0.5)
     np.testing.assert_allclose(grid.wRg[:, 2], inverse(tilted)[:3, :3] @ [0, -1, 0], atol=0.01)
+
+
+RAMP_M, RISE = 1.5, 0.2  # where it begins, and how steep it is
+
+
+def on_a_ramp(wTc: FloatArray, hole: bool) -> DepthFrame:
+    """A level road that becomes a ramp, with a post on it at 3 m and a wall at 5 m."""
+    start = wTc[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = (FLOOR_M - start[1]) / RAYS[..., 1]
+        ramp = (FLOOR_M - start[1] - RISE * (start[2] - RAMP_M)) / (RAYS[..., 1] + RISE)
+        road = np.where((level > 0.0) & (start[2] + level < RAMP_M), level, ramp)
+    depth = np.minimum(5.0 - start[2], np.where(road > 0.0, road, np.inf))
+    post = 3.0 - start[2]
+    depth[(np.abs(start[0] + post * RAYS[..., 0] - 0.4) < 0.1) & (post < depth)] = post
+    if hole:  # wrong matches that lie far below
+        depth[50:52, 40:42] += 1.0
+    full, image = np.full(SHAPE, SIGMA, np.float32), np.full(SHAPE, 99, np.uint8)
+    return DepthFrame(depth.astype(np.float32), full, image, wTc, np.zeros(SHAPE, np.float32))
+
+
+@pytest.mark.usefixtures("open3d")
+def test_a_ramp_is_ground_and_what_stands_on_it_is_in_the_way() -> None:
+    ways = 0.1 * np.arange(16)
+    heights = -RISE * np.maximum(ways - RAMP_M, 0.0)
+    places = [np.array([0.0, y, z]) for y, z in zip(heights, ways, strict=True)]
+    frames = [on_a_ramp(pose(np.eye(3), place), k == 3) for k, place in enumerate(places)]
+    surface = fused(frames)
+    up = np.array([0.0, -1.0, 0.0])
+    grid = make_grid(surface, [(f.depth, f.wTc) for f in frames], RAYS, up, VOXEL)
+    for x in (1.0, 2.0, 3.0, 4.0):  # up to half a metre above the first camera's floor
+        assert cell(grid, x, 0.0) == FREE
+        row, column = cell_at(grid, x, 0.0)
+        expected = RISE * max(x - RAMP_M, 0.0) - FLOOR_M
+        assert grid.ground[row, column] == pytest.approx(expected, abs=0.06)
+    assert OCCUPIED in {cell(grid, 3.0 + d, -0.4) for d in (-0.05, -0.02, 0.03)}
+    assert OCCUPIED in {cell(grid, 5.0 + d, 0.5) for d in (-0.05, -0.02, 0.03)}
 
 
 @pytest.mark.usefixtures("open3d")

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from bags import PERIOD_NS, START_NS, camera_info, raw_image, write_bag
+from dataset_builders import CALIBRATION, HEIGHT, WIDTH, save, write_calibration
 from textured_wall import RIG, WALL_M, pictures
 
+import fgslam as fg
 from fgslam.core.arrays import Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.geometry import pose
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Observations
 from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory
+from fgslam.runs.bare import bare_experiment
 from fgslam.runs.dense import DenseMap, DenseSettings, fuse
+from fgslam.runs.export import frames_of
+from fgslam.runs.opening import open_sequence
 
 PLACES = [np.array([0.1 * k, 0.0, 0.05 * k]) for k in range(4)]
 POSE_SIGMA_M = 0.003
@@ -81,6 +89,75 @@ def test_a_depth_camera_is_taken_at_its_word_and_the_voxels_fit_its_depth() -> N
     found = fused(DenseSettings(every=1), depths=depths)
     assert found.voxel_m == pytest.approx(3.0 * WALL_M / RIG.fx, rel=0.1)
     assert np.abs(found.surface.positions[:, 2] - WALL_M).max() < 0.002
+
+
+COLOUR = np.full((HEIGHT, WIDTH, 3), (200, 100, 50), np.uint8)  # red, green, blue
+MILLIMETRES = np.full((HEIGHT, WIDTH), 1500, np.uint16)
+
+
+def depth_folder(root: Path) -> Path:
+    for name, image in (("rgb", COLOUR[..., ::-1]), ("depth", MILLIMETRES)):
+        (root / name).mkdir(parents=True)
+        for k in range(3):
+            cv2.imwrite(str(root / name / f"{k:06d}.png"), image)
+    write_calibration(root, depth_scale=1000.0)
+    return root
+
+
+def depth_bag(path: Path) -> Path:
+    written = []
+    for k in range(3):
+        for topic, kind, fields in (
+            ("/camera/color/image_raw", "Image", raw_image(COLOUR, "rgb8")),
+            ("/camera/color/camera_info", "CameraInfo", camera_info(0.0)),
+            ("/camera/aligned_depth_to_color/image_raw", "Image", raw_image(MILLIMETRES, "16UC1")),
+        ):
+            written.append((topic, START_NS + k * PERIOD_NS, f"sensor_msgs/msg/{kind}", fields))
+    return write_bag(path, written)
+
+
+@pytest.mark.usefixtures("open3d")
+@pytest.mark.parametrize("name", ["folder", "walk.bag", "walk.mcap"])
+def test_depth_of_folders_and_bags_is_fused_in_its_colours(tmp_path: Path, name: str) -> None:
+    path = (depth_folder if name == "folder" else depth_bag)(tmp_path / name)
+    config = bare_experiment(path, None, []).config
+    recording = open_sequence(config)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    found = Trajectory(recording.timestamps, poses, "right")
+    log = log_of(recording.rig)
+    settled = Estimate(found, np.zeros((3, 6, 6)), NO_LANDMARKS)
+    made = fuse(log, settled, *frames_of(config, found), DenseSettings(every=1))
+    assert made.frames == 3
+    assert np.abs(made.surface.positions[:, 2] - 1.5).max() < 0.002
+    assert np.abs(made.surface.colours.astype(int) - COLOUR[0, 0]).max() <= 1
+    assert np.ptp(made.surface.positions[:, 0]) > 0.7 * WIDTH / CALIBRATION["fx"] * 1.5
+
+
+@pytest.mark.usefixtures("open3d")
+def test_the_dense_map_of_a_session_from_its_frames_or_from_the_recording(tmp_path: Path) -> None:
+    frames = []
+    for k, place in enumerate(PLACES[::2]):
+        right, left, top = pictures(place)
+        for name, image in (("left", left), ("right", right), ("top", top)):
+            save(tmp_path / "walk" / name / f"{k:06d}.png", image)
+        frames.append((0.1 * k, (left, right, top)))
+    matrix = {"width": RIG.width, "height": RIG.height, "fx": RIG.fx, "fy": RIG.fy}
+    centre = {"cx": RIG.cx, "cy": RIG.cy, "baseline_m": 0.1, "vertical_baseline_m": 0.1}
+    write_calibration(tmp_path / "walk", **matrix, **centre)
+    (tmp_path / "walk" / "times.txt").write_text("0 0.0\n1 0.1\n")
+    with fg.Slam(RIG, "landmark_kalman") as slam:
+        for t, images in frames:
+            slam.track(t, images)
+    result = slam.result()
+    for name, given in (("a", frames), ("b", fg.open_recording(tmp_path / "walk"))):
+        found = result.dense_map(given, every=1, voxel_m=0.05)
+        found.surface.save(tmp_path / f"{name}.ply")
+        assert np.median(np.abs(found.surface.positions[:, 2] - WALL_M)) < 0.01
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    lost = [frames[0], (0.1, None)]
+    assert result.dense_map(lost, every=1, voxel_m=0.05).frames == 1
+    with pytest.raises(DatasetError, match="this recording has other times than the run"):
+        result.dense_map(frames[1:])
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:

@@ -361,7 +361,9 @@ def test_a_map_has_identities_and_an_open3d_cloud(
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_landmarks_have_the_colours_of_the_images_that_began_them(folder: Path, bits: int) -> None:
+def test_landmarks_have_the_colours_of_the_images_that_began_them(
+    folder: Path, bits: int, tmp_path: Path
+) -> None:
     recording = fg.open_recording(folder)
     plain, coloured = (fg.Slam(recording.rig, "landmark_kalman") for _ in range(2))
     tint = np.array([1.0, 0.5, 0.25])
@@ -376,10 +378,30 @@ def test_landmarks_have_the_colours_of_the_images_that_began_them(folder: Path, 
     bright = colours[colours[:, 0] > 60]
     assert np.abs(bright[:, 1] - bright[:, 0] / 2.0).max() <= 1.0
     assert np.abs(bright[:, 2] - bright[:, 0] / 4.0).max() <= 1.0
-    grey = plain.result().map.colours
-    assert (grey == grey[:, :1]).all()
+    grey = plain.result().map
+    assert (grey.colours == grey.colours[:, :1]).all()
+    grey.save(tmp_path / "grey.fgmap")
+    assert (fg.Map.load(tmp_path / "grey.fgmap").colours == grey.colours).all()
+    coloured.result().map.save(tmp_path / "map.fgmap")
+    read = fg.Map.load(tmp_path / "map.fgmap")
+    np.testing.assert_array_equal(read.colours, colours)
     for slam in (plain, coloured):
         slam.close()
+
+
+def test_a_session_in_a_map_keeps_its_colours(
+    folder: Path, driven: tuple[fg.Slam, fg.Result], rng: np.random.Generator
+) -> None:
+    recording, made = fg.open_recording(folder), driven[1].map
+    colours = rng.integers(0, 255, (len(made), 3), np.uint8)
+    coloured = dataclasses.replace(made, saved=dataclasses.replace(made.saved, colours=colours))
+    with fg.Slam(recording.rig, "landmark_kalman", start_map=coloured) as slam:
+        for t, images, odometry in recording:
+            slam.track(t, images, odometry)
+        found = slam.result().map
+    before, after = np.isin(made.ids, found.ids), np.isin(found.ids, made.ids)
+    assert before.sum() > 10
+    np.testing.assert_array_equal(found.saved.shown[after], colours[before])
 
 
 def test_images_in_one_array_or_with_one_channel_are_as_good_as_a_tuple(folder: Path) -> None:

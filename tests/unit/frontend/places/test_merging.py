@@ -87,6 +87,16 @@ def world(rng: np.random.Generator) -> World:
     return World(rng)
 
 
+def test_a_merged_map_has_colours_where_either_has(world: World) -> None:
+    first, second = (world.seen(np.arange(k, 280 + k), np.eye(4), 10.0 * k) for k in (0, 120))
+    alignment = align(first, second)
+    assert merge_maps(first, second, alignment).colours is None
+    second = replace(second, colours=np.full((280, 3), (1, 2, 3), np.uint8))
+    merged = merge_maps(first, second, alignment)
+    assert merged.shown[0].tolist() == [90, 90, 90]
+    assert merged.shown[-1].tolist() == [1, 2, 3]
+
+
 def align(a: SavedMap, b: SavedMap, seed: int = 0) -> Alignment:
     return align_maps(a, b, np.random.default_rng(seed), "a and b")
 
