@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.evidence import (
     chess,
     compact_memory,
+    consistency,
     dense,
     drives,
     euroc_raw,
@@ -68,6 +69,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "sizes": lambda data: sizes.tables(),
     "rig_honesty": rig_honesty.tables,
     "visits": lambda data: visits.tables(),
+    "consistency": lambda data: consistency.tables(),
     "compact_memory": lambda data: compact_memory.tables(),
     "witnesses": witnesses.tables,
     "wrong_mirror": lambda data: wrong_mirror.tables(),

@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.runs import EXPERIMENTS, say
 from benchmarks.tables import Cell, Table
 from fgslam.backend.considered import fused, pixels_of, shared_covariance
+from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
     EkfSettings,
@@ -92,10 +93,12 @@ class Drive:
         recording = open_measurements(config.dataset, config.seed, config.odometry)
         return Drive(recording, config.frontend.ego_motion)
 
-    def judged(self, settings: EstimatorSettings, log: MeasurementLog | None = None) -> Judged:
+    def judged(
+        self, estimator: EstimatorSettings | Estimator, log: MeasurementLog | None = None
+    ) -> Judged:
         """A replay's numbers; another log than the drive's own may be given."""
         of = self.recording
-        played = replay(of.log if log is None else log, settings, self.ego_motion)
+        played = replay(of.log if log is None else log, estimator, self.ego_motion)
         found = judge_replay(played, Truth(of.ground_truth, of.landmark_truth)).metrics
         online: Any = found.more["online"]
         final: Any = found.more["coverage"]

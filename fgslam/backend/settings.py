@@ -87,11 +87,10 @@ class LandmarkKalmanGraphSettings(PerLandmarkSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class EkfSettings(NamedSettings):
-    """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
+class JointFilterSettings(NamedSettings):
+    """What filters with one joint covariance of pose and landmarks share."""
 
     family: ClassVar[Family] = "filter"
-    kind: Literal["ekf"] = "ekf"
     floor: FloorMode = Field(
         default="auto",
         description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
@@ -104,6 +103,20 @@ class EkfSettings(NamedSettings):
         default=4000,
         description="more are refused; memory 72 n^2 bytes, up to half more in reserve",
     )
+
+
+@dataclass(frozen=True, config=STRICT)
+class EkfSettings(JointFilterSettings):
+    """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
+
+    kind: Literal["ekf"] = "ekf"
+
+
+@dataclass(frozen=True, config=STRICT)
+class InvariantEkfSettings(JointFilterSettings):
+    """The same filter with errors that a turn of the whole world leaves as they are."""
+
+    kind: Literal["invariant_ekf"] = "invariant_ekf"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -189,6 +202,7 @@ EstimatorSettings: TypeAlias = Annotated[
     | LandmarkKalmanSettings
     | LandmarkKalmanGraphSettings
     | EkfSettings
+    | InvariantEkfSettings
     | FixedLagSettings
     | Isam2Settings
     | SlidingWindowSettings

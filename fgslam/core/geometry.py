@@ -137,7 +137,8 @@ def inverse(aTb: FloatArray) -> FloatArray:
     return out
 
 
-def _so3_left_jacobian(omega: FloatArray) -> FloatArray:
+def so3_left_jacobian(omega: FloatArray) -> FloatArray:
+    """(3, 3) ``V``: turned by ``omega`` in unit time, a velocity v leads by ``V v``."""
     theta2 = float(omega @ omega)
     theta = np.sqrt(theta2)
     if theta < _SMALL_ANGLE:
@@ -161,7 +162,7 @@ def _so3_left_jacobian_inverse(omega: FloatArray) -> FloatArray:
 
 def se3_exp(xi: FloatArray) -> FloatArray:
     """Rigid motion (4, 4) of a tangent vector (6,) [rotation, translation]; GTSAM's Expmap."""
-    return pose(so3_exp(xi[:3]), _so3_left_jacobian(xi[:3]) @ xi[3:])
+    return pose(so3_exp(xi[:3]), so3_left_jacobian(xi[:3]) @ xi[3:])
 
 
 def moved_apart(aTb: FloatArray, step: FloatArray) -> FloatArray:

@@ -163,6 +163,9 @@ _MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], 
     "ekf": lambda rig, own, prior, ego: import_module("fgslam.backend.filters.ekf").FullEkf(
         rig, own, make_floor(rig, own.floor, ego.dof), prior
     ),
+    "invariant_ekf": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.filters.invariant_ekf"
+    ).InvariantEkf(rig, own, make_floor(rig, own.floor, ego.dof), prior),
     "fixed_lag": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.smoothers.lag"
     ).fixed_lag_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),

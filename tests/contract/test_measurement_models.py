@@ -28,7 +28,9 @@ from fgslam.factors.measurement import MeasurementModel, PoseModel, gtsam_factor
 from fgslam.factors.models import Position, Range
 from fgslam.slam.build import make_estimator
 
-ESTIMATORS = ("landmark_kalman", "ekf", "fixed_lag", "sliding_window", "isam2", "batch")
+ESTIMATORS = (
+    "landmark_kalman", "ekf", "invariant_ekf", "fixed_lag", "sliding_window", "isam2", "batch",
+)  # fmt: skip
 EVERY = [*MODELS.values(), RelativePoint(SENSOR)]
 KIND = pytest.mark.parametrize("model", EVERY, ids=lambda model: model.kind)
 

@@ -25,7 +25,7 @@ from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
 from fgslam.backend.measured import Waiting, linearised, require_model
-from fgslam.backend.settings import EkfSettings
+from fgslam.backend.settings import JointFilterSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
@@ -227,7 +227,7 @@ class FullEkf:
     _waiting: Kept[Waiting]
 
     def __init__(
-        self, sensor: CameraRig, settings: EkfSettings, floor: Floor, prior: Prediction
+        self, sensor: CameraRig, settings: JointFilterSettings, floor: Floor, prior: Prediction
     ) -> None:
         """Starts at the prior pose, brought onto a hard floor, with an empty map."""
         self._sensor = sensor
@@ -306,7 +306,7 @@ class FullEkf:
             size = (FRONT + BLOCK * count) ** 2 * 8 / 1e9
             raise EstimatorError(
                 f"{where}: {count} landmarks exceed max_landmarks "
-                f"{self._settings.max_landmarks} of the ekf (their joint covariance takes "
+                f"{self._settings.max_landmarks} of the {self.kind} (their joint covariance takes "
                 f"{size:.2g} GB and each update time in proportion); raise it, prune earlier, or "
                 "use isam2"
             )
@@ -358,7 +358,7 @@ class FullEkf:
             return correct(self._covariance, front, matches, of_pose, self._settings.gate_sigmas)
         except DivergedError as cause:
             raise EstimatorError(
-                f"frame {index}: the ekf has diverged: {cause}; use isam2, which "
+                f"frame {index}: the {self.kind} has diverged: {cause}; use isam2, which "
                 "relinearises, or state the odometry's and the measurements' noise larger"
             ) from None
 
@@ -398,13 +398,13 @@ class FullEkf:
         blocks = self._blocks(seen.ids)
 
         def matches_at(step: FloatArray) -> Matches:
-            moved = step[FRONT:].reshape(-1, 3)[blocks]
-            there = self._retracted(self._wTc, step[:FRONT])
-            positions = self._positions[blocks] + moved
-            found = Matches.of(self._sensor, there, np.arange(len(moved)), positions, seen)
+            there, positions = self._retracted(self._wTc, self._positions, step)
+            found = Matches.of(self._sensor, there, blocks, positions[blocks], seen)
+            found = self._by_errors_before(found, step, there, positions)
+            moved = step[FRONT:].reshape(-1, 3)[found.blocks]
             since = found.by_pose @ step[:FRONT]
-            since += np.einsum("kij,kj->ki", found.by_landmark, moved[found.blocks])
-            return replace(found, blocks=blocks[found.blocks], innovation=found.innovation + since)
+            since += np.einsum("kij,kj->ki", found.by_landmark, moved)
+            return replace(found, innovation=found.innovation + since)
 
         try:
             found = correct_iterated(self._covariance, matches_at, self._fixed)
@@ -427,28 +427,35 @@ class FullEkf:
         self._covariance.set_front(front)
         if found.gain.shape[1]:
             self._covariance.subtract(found.gain, found.half)
-            self._positions = self._positions + found.step[FRONT:].reshape(-1, 3)
-            wTc = self._retract(wTc, found.step[:FRONT])
+            moved, positions = self._retracted(wTc, self._positions, found.step)
+            self._carry_errors(wTc, moved, positions)
+            wTc, self._positions = moved, positions
         self._wTc = reorthonormalise(wTc)
         self._map = None
 
-    def _retract(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
-        """The corrected pose; on a hard floor its errors are carried into the new pose's axes."""
-        moved = self._retracted(wTc, step)
+    def _retracted(
+        self, wTc: FloatArray, positions: FloatArray, step: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pose and landmarks moved by a step (n,), the pose staying on a hard floor."""
+        positions = positions + step[FRONT:].reshape(-1, 3)
         if self._floor.rigid_dof == 6:
-            return moved
-        carry = self._floor.basis(moved) @ self._floor.basis(wTc).T
-        front = self._covariance.front()
-        front[FRONT:] = front[FRONT:] @ carry.T
-        front[:FRONT] = congruence(carry, front[:FRONT])
-        self._covariance.set_front(front)
-        return moved
+            return wTc @ se3_exp(step[:FRONT]), positions
+        return self._floor.constrain(moved_apart(wTc, step[:FRONT])), positions
 
-    def _retracted(self, wTc: FloatArray, step: FloatArray) -> FloatArray:
-        """The pose moved by a step (6,), on a hard floor."""
-        if self._floor.rigid_dof == 6:
-            return wTc @ se3_exp(step)
-        return self._floor.constrain(moved_apart(wTc, step))
+    def _carry_errors(self, wTc: FloatArray, moved: FloatArray, positions: FloatArray) -> None:
+        """The covariance in the errors of the state moved to; a hard floor turns the pose's."""
+        if self._floor.rigid_dof < 6:
+            carry = self._floor.basis(moved) @ self._floor.basis(wTc).T
+            front = self._covariance.front()
+            front[FRONT:] = front[FRONT:] @ carry.T
+            front[:FRONT] = congruence(carry, front[:FRONT])
+            self._covariance.set_front(front)
+
+    def _by_errors_before(
+        self, matches: Matches, step: FloatArray, moved: FloatArray, positions: FloatArray
+    ) -> Matches:
+        """Matches linearised where a step (n,) leads, by the step."""
+        return matches
 
     def _drop(self, increment: Increment) -> None:
         gone = np.flatnonzero(np.isin(self._ids, increment.pruned_ids))

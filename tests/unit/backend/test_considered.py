@@ -30,6 +30,7 @@ from fgslam.backend.settings import (
     EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
+    InvariantEkfSettings,
     Isam2Settings,
     KernelSettings,
     LandmarkKalmanGraphSettings,
@@ -351,6 +352,7 @@ ONLINE: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),
     "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
     "ekf": EkfSettings(),
+    "invariant_ekf": InvariantEkfSettings(),
     "isam2": Isam2Settings(noise_factor=1.0),
     "fixed_lag": FixedLagSettings(lag_frames=5, noise_factor=1.0),
 }

@@ -20,6 +20,7 @@ from fgslam.backend.settings import (
     EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
+    InvariantEkfSettings,
     Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
@@ -47,10 +48,11 @@ USERS: list[EstimatorSettings] = [
     LandmarkKalmanSettings(),
     LandmarkKalmanGraphSettings(),
     EkfSettings(),
+    InvariantEkfSettings(),
     Isam2Settings(update_every=1),
     BatchSettings(),
 ]
-KEEPERS = USERS[:3]
+KEEPERS = USERS[:4]
 
 
 def random_covariances(rng: np.random.Generator, n: int, sigma: float) -> FloatArray:
@@ -125,7 +127,7 @@ def test_observed_landmarks_become_more_certain_and_others_stay(
     np.testing.assert_allclose(now[20:], before[20:], rtol=1e-12)
 
 
-@pytest.mark.parametrize("settings", [USERS[2], USERS[4], USERS[3]], ids=lambda s: s.kind)
+@pytest.mark.parametrize("settings", USERS[2:], ids=lambda s: s.kind)
 def test_the_first_pose_is_as_uncertain_as_prior_map_and_measurement_say(
     settings: EstimatorSettings, saved: SavedMap
 ) -> None:
@@ -185,7 +187,7 @@ def test_estimators_that_cannot_use_a_map_are_refused(settings: EstimatorSetting
         require_map_user(estimator, extends=True)
 
 
-@pytest.mark.parametrize("settings", USERS[3:], ids=lambda s: s.kind)
+@pytest.mark.parametrize("settings", USERS[len(KEEPERS) :], ids=lambda s: s.kind)
 def test_smoothers_do_not_keep_a_map(settings: EstimatorSettings) -> None:
     with pytest.raises(ConfigError, match="cannot leave a map as it is"):
         require_map_user(make_estimator(RIG, settings), extends=False)
