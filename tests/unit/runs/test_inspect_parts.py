@@ -69,10 +69,12 @@ def test_images_of_one_camera_are_called_so(tmp_path: Path, inside: str) -> None
     (tmp_path / "gyro.csv").write_text("time,gyro_x,gyro_y,gyro_z\n0,0,0,0\n", encoding="utf-8")
     for k in range(4):
         save(tmp_path / inside / f"{k:06d}.png", picture(k))
-    with pytest.raises(
-        DatasetError, match=r"holds images of one camera only; .* a gyroscope, too.* side by"
-    ):
-        recognise_layout(tmp_path)
+    if inside != ".":
+        with pytest.raises(DatasetError, match=rf"in it has {tmp_path / inside}: give that folder"):
+            recognise_layout(tmp_path)
+    words = r"one camera alone is not enough, with a gyroscope, too .* shows both views"
+    with pytest.raises(DatasetError, match=words):
+        inspect_recording(tmp_path / inside)
 
 
 def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
