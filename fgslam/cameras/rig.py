@@ -180,19 +180,18 @@ def require_options(size: object, unit_m: object, fov_deg: object, cameras: obje
     """Raises CalibrationError where an option of a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
-    if size is not None and not whole:
-        raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
-    if not is_finite_number(unit_m) or not float(unit_m) > 0.0:  # type: ignore[arg-type]
-        raise CalibrationError(f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres")
+    positive = is_finite_number(unit_m) and float(unit_m) > 0.0  # type: ignore[arg-type]
     within = is_finite_number(fov_deg) and 0.0 < float(fov_deg) < _WIDEST_DEG  # type: ignore[arg-type]
-    if fov_deg is not None and not within:
-        raise CalibrationError(
-            f"fov_deg is {fov_deg!r}; a perspective view takes 0 to {_WIDEST_DEG:.0f} degrees"
-        )
-    if cameras is not None and not isinstance(cameras, list | tuple | range):
-        raise CalibrationError(
-            f"cameras is a {type(cameras).__name__}; give a list of two or three numbers, or None"
-        )
+    of, widest = type(cameras).__name__, f"{_WIDEST_DEG:.0f} degrees"
+    for good, text in (
+        (size is None or whole, f"size is {size!r}; give (width, height) of the images in pixels"),
+        (positive, f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres"),
+        (fov_deg is None or within, f"fov_deg is {fov_deg!r}; a view takes 0 to {widest}"),
+        (cameras is None or isinstance(cameras, list | tuple | range),
+         f"cameras is a {of}; give a list of two or three numbers, or None"),
+    ):  # fmt: skip
+        if not good:
+            raise CalibrationError(text)
 
 
 def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> StereoRig | None:
@@ -303,6 +302,7 @@ _REMEDIES = {
     ".mat": "in MATLAB, [K1,D1,K2,D2,R,T] = stereoParametersToOpenCV(stereoParams), then write by "
     f"jsonencode {_AS_JSON} (--unit 0.001 where the squares were in millimetres)",
     ".pkl": f"a pickle may run programs; write {_AS_JSON}",
+    ".bin": "write COLMAP's as text: colmap model_converter --output_type TXT",
     ".npz": f"write its arrays to {_AS_JSON}",
 }
 """What to do with files that hold calibrations in a form of one program."""

@@ -261,7 +261,7 @@ def _associated(path: Path, fps: float | None) -> tuple[Pairs, Stamps]:
 
     So ICL-NUIM's do.
     """
-    rows = [(number, text.split()) for number, text in read_lines(path)]
+    rows = [(number, text.replace(",", " ").split()) for number, text in read_lines(path)]
     for number, words in rows:
         if len(words) != 4 or not all(re.fullmatch(r"\d+(\.\d+)?", w) for w in words[::2]):
             raise DatasetError(

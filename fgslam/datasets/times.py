@@ -130,7 +130,15 @@ def read_tum(path: Path) -> Trajectory:
     Raises:
         DatasetError: a line is malformed, times do not increase, or a quaternion is no rotation.
     """
-    table = read_table(path, TUM_COLUMNS)
+    lines = [(line, text.replace(",", " ")) for line, text in read_lines(path)]
+    if lines and re.match(r"\s*[A-Za-z]", lines[0][1]):
+        lines = lines[1:]  # names of columns
+    if lines and len(lines[0][1].split()) == 12:
+        raise DatasetError(
+            f"{path}: its rows of 12 numbers are poses without times, as KITTI's; write "
+            f"{' '.join(TUM_COLUMNS)}"
+        )
+    table = read_table(path, TUM_COLUMNS, lines=lines)
     require_increasing(table, table.values[:, 0])
     poses = poses_of(table, table.values[:, 1:4], table.values[:, 4:8])
     return Trajectory(table.values[:, 0], poses)
@@ -473,7 +481,8 @@ def listed_files(
     stamps: list[int] = []
     files: list[Path] = []
     for line, text in lines:
-        time, name = (*map(str.strip, text.split(delimiter)), "", "")[:2]
+        words = (text if delimiter else text.replace(",", " ")).split(delimiter)
+        time, name = (*map(str.strip, words), "", "")[:2]
         if not re.fullmatch(stamp, time) or not name:
             raise DatasetError(f"{path}, line {line}: expected {expected}")
         whole, _, part = time.partition(".")

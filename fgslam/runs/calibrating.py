@@ -562,6 +562,8 @@ def _about(rig: StereoRig, found: Calibration) -> list[str]:
     if rig.vertical_baseline is not None:
         lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
     what = "rectified already" if rig.rectifier is None else "rectified view"
+    if rig.format.startswith("OpenCV"):
+        lines.append("unit: taken as metres, which the file does not state (--unit)")
     return [*lines, f"{what}: {_view_words(rig)}", *rig.remarks]
 
 

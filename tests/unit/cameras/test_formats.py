@@ -368,6 +368,7 @@ def test_a_camchain_that_contradicts_itself_is_told(tmp_path: Path) -> None:
         ("stereoParams.mat", "stereoParametersToOpenCV"),
         ("calib.pkl", "a pickle may run programs; write a .json of M1"),
         ("calib.npz", "write its arrays to a .json of M1"),
+        ("cameras.bin", "as text: colmap model_converter"),
         ("calib.yaml", r"baseline, fx are keys of fgslam's calib\.json; write it so"),
     ],
 )

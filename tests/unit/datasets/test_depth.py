@@ -320,8 +320,9 @@ def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("depth_first", [False, True])
 @pytest.mark.parametrize("counted", [False, True])
+@pytest.mark.parametrize("mark", [" ", ","])
 def test_a_list_of_associations_pairs_and_times(
-    tmp_path: Path, depth_first: bool, counted: bool
+    tmp_path: Path, depth_first: bool, counted: bool, mark: str
 ) -> None:
     lines = []
     for k in range(4):
@@ -332,7 +333,8 @@ def test_a_list_of_associations_pairs_and_times(
         )
         words = [f"{colour_at} rgb/{k}.png", f"{depth_at} depth/{7 - k}.png"]
         lines.append(" ".join(words[::-1] if depth_first else words))
-    (tmp_path / "associations.txt").write_text("\n".join(lines), encoding="utf-8")
+    text = "\n".join(lines).replace(" ", mark)
+    (tmp_path / "associations.txt").write_text(text, encoding="utf-8")
     camera(tmp_path)
     recording = opened(tmp_path, depth_scale=1000.0)
     step = np.diff(recording.timestamps)

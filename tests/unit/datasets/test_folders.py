@@ -153,6 +153,20 @@ def test_truth_in_nanoseconds_is_that_in_seconds(tmp_path: Path) -> None:
     assert "are read as nanoseconds" in recording.notes[-1]
 
 
+def test_truth_with_commas_and_names_of_columns_is_read(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    rows = [f"{0.1 * k:.1f},0,0,{0.1 * k:.1f},0,0,0,1" for k in range(6)]
+    text = "\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows])
+    (root / "groundtruth.txt").write_text(text, encoding="utf-8")
+    truth = opened(root).ground_truth
+    assert truth is not None
+    assert truth.frame == "right"
+    np.testing.assert_allclose(truth.poses[5, :3, 3], [0.2, 0.0, 0.5], rtol=0.0, atol=1e-9)
+    (root / "groundtruth.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 6, encoding="utf-8")
+    with pytest.raises(DatasetError, match="12 numbers are poses without times, as KITTI's; write"):
+        opened(root)
+
+
 def test_truth_of_another_clock_is_refused_with_both_spans(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     stamps = 1305031102.17 + 0.1 * np.arange(6)
