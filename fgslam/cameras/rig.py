@@ -182,11 +182,11 @@ def require_options(size: object, unit_m: object, fov_deg: object, cameras: obje
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
     positive = is_finite_number(unit_m) and float(unit_m) > 0.0  # type: ignore[arg-type]
     within = is_finite_number(fov_deg) and 0.0 < float(fov_deg) < _WIDEST_DEG  # type: ignore[arg-type]
-    of, widest = type(cameras).__name__, f"{_WIDEST_DEG:.0f} degrees"
+    of, widest = type(cameras).__name__, f"a perspective view takes 0 to {_WIDEST_DEG:.0f} degrees"
     for good, text in (
         (size is None or whole, f"size is {size!r}; give (width, height) of the images in pixels"),
         (positive, f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres"),
-        (fov_deg is None or within, f"fov_deg is {fov_deg!r}; a view takes 0 to {widest}"),
+        (fov_deg is None or within, f"fov_deg is {fov_deg!r}; {widest}"),
         (cameras is None or isinstance(cameras, list | tuple | range),
          f"cameras is a {of}; give a list of two or three numbers, or None"),
     ):  # fmt: skip
