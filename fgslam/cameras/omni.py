@@ -403,8 +403,6 @@ class HyperbolicMirror(RadialCamera):
         size: tuple[int, int],
         xi: float,
         elevations: tuple[float, float],
-        ahead: float = AHEAD_IS_UP,
-        clockwise: bool = True,
         margin_px: float = 0.0,
     ) -> HyperbolicMirror:
         """A mirror centred in a picture (width, height), whose rim touches the nearest border.
@@ -423,8 +421,7 @@ class HyperbolicMirror(RadialCamera):
         outer = (min(size) - 1) / 2.0 - margin_px
         focal_px = outer * (xi - np.sin(highest)) / np.cos(highest)
         inner = focal_px * np.cos(lowest) / (xi - np.sin(lowest))
-        centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
-        frame = MirrorFrame(*size, centre, ahead, clockwise)
+        frame = MirrorFrame(*size, ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0))
         return cls(frame, float(inner), outer, xi=xi, focal_px=float(focal_px))
 
     def elevation(self, radius: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni import PAPER_DEGREE, MirrorFrame, RadialPolynomial, fit_radial_polynomial
+from fgslam.cameras.omni import MirrorFrame, RadialPolynomial, fit_radial_polynomial
 from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 
@@ -233,7 +233,6 @@ def calibrate_from_rings(
     elevations: FloatArray,
     frame: MirrorFrame,
     radii: tuple[float, float],
-    degree: int = PAPER_DEGREE,
 ) -> RingCalibration:
     """Fits the paper's polynomial to a picture of black and white rings around the camera.
 
@@ -245,7 +244,6 @@ def calibrate_from_rings(
         elevations: (n,) of the rings in radians, from the inner to the outer one.
         frame: where the mirror lies; :func:`find_mirror_circle` finds its centre.
         radii: inner and outer, pixels: the rings lie between.
-        degree: of the polynomial.
 
     Raises:
         CalibrationError: fewer than half of the directions show all rings, or the fit fails.
@@ -265,9 +263,7 @@ def calibrate_from_rings(
             "rings; check the number of elevations, the centre and the radii"
         )
     ring_radii = np.median(each, axis=0)
-    camera, worst = fit_radial_polynomial(
-        frame, radii, (ring_radii, np.asarray(elevations)), degree
-    )
+    camera, worst = fit_radial_polynomial(frame, radii, (ring_radii, np.asarray(elevations)))
     return RingCalibration(camera, worst, ring_radii, directions)
 
 

@@ -48,8 +48,7 @@ def write_calibration(
     if name is None:
         known = ", ".join(f"{ending} ({form})" for ending, form in _ENDINGS.items() if ending)
         raise CalibrationError(
-            f"{path}: no format ends like that; known: {known}, and no ending (a folder for ROS); "
-            f"or give --format, one of {', '.join(FORMATS)}"
+            f"{path}: no format ends like that; known: {known}, and no ending (a folder for ROS)"
         )
     if name not in FORMATS:
         raise CalibrationError(f"format {name!r} is not known; use {', '.join(FORMATS)}")

@@ -212,11 +212,14 @@ def interpolate_poses(trajectory: Trajectory, at: FloatArray) -> FloatArray:
     return out
 
 
+_SAME_TIME_S = 1e-3  # of a pose and a frame
+
+
 def trajectory_at_frames(
-    trajectory: Trajectory, frames: FloatArray, max_gap: float = 0.1, tolerance: float = 1e-3
+    trajectory: Trajectory, frames: FloatArray, max_gap: float = 0.1
 ) -> Trajectory:
     """The trajectory at those of the frames' stamps (n,) that it covers (see :func:`covered`)."""
-    known = covered(trajectory.timestamps, frames, max_gap, tolerance)
+    known = covered(trajectory.timestamps, frames, max_gap, _SAME_TIME_S)
     poses = interpolate_poses(trajectory, frames[known])
     return replace(trajectory, timestamps=frames[known], poses=poses)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +67,11 @@ def test_the_raw_mirror_image_is_seen_from_below() -> None:
     np.testing.assert_allclose(ahead, [159.5, 119.5 - horizon], atol=1e-9)
     np.testing.assert_allclose(left, [159.5 + horizon, 119.5], atol=1e-9)
     assert 119.5 - horizon < down[1] < 119.5
-    flipped = HyperbolicMirror.with_view((320, 240), 0.92, (-1.1, 0.4), clockwise=False)
+    flipped = replace(camera, frame=replace(camera.frame, clockwise=False))
     np.testing.assert_allclose(
         flipped.pixels(np.array([[0, 2.0, 0]]))[0], [159.5 - horizon, 119.5], atol=1e-9
     )
-    turned = HyperbolicMirror.with_view((320, 240), 0.92, (-1.1, 0.4), ahead=0.0)
+    turned = replace(camera, frame=replace(camera.frame, ahead=0.0))
     np.testing.assert_allclose(
         turned.pixels(np.array([[2.0, 0, 0]]))[0], [159.5 + horizon, 119.5], atol=1e-9
     )
