@@ -35,6 +35,7 @@ class Chosen:
         numbers: which cameras of the calibration file the views are, so that it determines the
             sides; empty: the topics do.
         notes: what else could have been taken.
+        guessed: whether other topics could be meant as well.
         depth: whether left is the depth of right, in place of a second camera.
         infos: of the camera_info of left and right; None where there is none.
         motion: of odometry, or None.
@@ -46,6 +47,7 @@ class Chosen:
     numbers: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     depth: bool = False
+    guessed: bool = False
     infos: tuple[str | None, str | None] = (None, None)
     motion: Topic | None = None
     transforms: tuple[str, ...] = ()
@@ -230,7 +232,8 @@ def _by_names(
         notes.insert(0, f"{text}: topics are recognised by their names")
     names = (*used, *(pair[1] for pair in third))
     numbers = (0, 1, 2) if third else ()
-    return Chosen(tuple(by_view[name] for name in names), numbers, tuple(notes))
+    shown = tuple(by_view[name] for name in names)
+    return Chosen(shown, numbers, tuple(notes), guessed=bool(also))
 
 
 def _list(topics: Sequence[Topic]) -> str:
@@ -297,7 +300,8 @@ def _colour_and_depth(images: Sequence[str]) -> Chosen | None:
     depth = min(depths, key=depth_rank)
     colour = min(colours, key=lambda v: (not _COLOUR.search(v), _rank(v), v))
     note = f"{depth} is the depth of {colour} (--topics COLOUR,DEPTH chooses others)"
-    return Chosen((depth, by_view[colour]), notes=(note,), depth=True)
+    several = len(depths) > 1 or len(colours) > 1
+    return Chosen((depth, by_view[colour]), notes=(note,), depth=True, guessed=several)
 
 
 def is_registered(topic: str) -> bool:

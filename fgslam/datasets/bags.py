@@ -152,7 +152,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
 
     shown = f"{chosen.left} is {'depth' if chosen.depth else 'left'}, {chosen.right} right"
     how = "--topics" if settings.topics else "types and names of topics"
-    topics = Entry(IMAGES, shown, how, "--topics", not settings.topics)
+    topics = Entry(IMAGES, shown, how, "--topics", chosen.guessed)
     return image_recording(
         settings,
         where.resolve().stem,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import BASELINE, FOCAL, write_recording
 from running import KIND, SAME_BYTES, bytes_of, main, metrics_of
 
 import fgslam as fg
@@ -102,3 +104,23 @@ def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
     assert sum(run.metrics["status_counts"].values()) == 18
     assert set(run.metrics["status_counts"]) == {"first", "ok", "relocalised"}
     assert numbers["ate_rmse_m"] < 0.02
+
+
+@pytest.mark.slow
+def test_a_run_s_figures_in_metres_have_a_mark_where_the_unit_is_a_guess(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_recording(tmp_path / "boards", frames=4, top=False)
+    (root / "calib.json").unlink()
+    matrix = [[FOCAL, 0.0, 79.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]]
+    values = {"image_size": [160, 120], "R": np.eye(3).tolist(), "T": [-BASELINE, 0.0, 0.0]}
+    values |= {f"M{k}": matrix for k in (1, 2)} | {f"D{k}": [0.0] * 5 for k in (1, 2)}
+    (root / "rig.json").write_text(json.dumps(values), encoding="utf-8")
+    arguments = ("run", root, "--camera", root / "rig.json", "--out", tmp_path / "out")
+    main(monkeypatch, *arguments)
+    said = capfd.readouterr().out
+    assert "ATE rms, SE3 aligned *" in said
+    assert "* rests on a guess" in said
+    assert "unit of length: 1 m (--unit)" in said
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "figures with * on a guess" in page

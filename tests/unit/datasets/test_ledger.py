@@ -14,6 +14,8 @@ from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.ledger import PAIRING, Entry, as_values, of_values, rests_on_guess
 from fgslam.datasets.opening import open_recording
 from fgslam.runs.config import make_config
+from fgslam.runs.report import on_guesses
+from fgslam.runs.tables import page_tables
 
 
 def ledger(given: Path, **changes: Any) -> dict[str, Entry]:
@@ -56,10 +58,12 @@ def test_the_unit_of_depth_is_a_guess_until_it_is_stated(tmp_path: Path) -> None
 
 
 def test_topics_are_guessed_or_named(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "a.bag", stereo())
-    guessed = ledger(bag)["images"]
-    assert guessed.value == "/cam/left/image_raw is left, /cam/right/image_raw right"
-    assert guessed.guessed
+    alone = ledger(write_bag(tmp_path / "one.bag", stereo()))["images"]
+    assert alone.value == "/cam/left/image_raw is left, /cam/right/image_raw right"
+    assert not alone.guessed
+    two = stereo() + stereo(names=("/rear/left", "/rear/right"))
+    bag = write_bag(tmp_path / "a.bag", two)
+    assert ledger(bag)["images"].guessed
     named = ("/cam/left/image_raw", "/cam/right/image_raw")
     assert not ledger(bag, topics=named)["images"].guessed
 
@@ -88,3 +92,16 @@ def test_figures_in_metres_rest_on_the_unit_and_angles_do_not() -> None:
     assert not rests_on_guess("23 of 24 frames", [unit, order])
     assert rests_on_guess("yaw 0.01 deg", [order])
     assert not rests_on_guess("12.34 cm", [unit._replace(guessed=False)])
+
+
+def test_columns_of_a_page_that_rest_on_a_guess_have_a_mark() -> None:
+    known = {"ate_rmse_m": 0.1, "rpe_rot_deg": 0.2, "landmarks": 3}
+    tables = page_tables({"landmark_kalman": known})
+    unit = Entry("unit of length", "1 m", "OpenCV states none", "--unit", guessed=True)
+    marked = [
+        c.name for table in tables for c in on_guesses(table, [unit]).columns if "*" in c.name
+    ]
+    plain = [c.name for table in tables for c in table.columns]
+    assert [name.removesuffix(" *") for name in marked] == [n for n in plain if "cm" in n]
+    assert len(marked) > 0
+    assert on_guesses(tables[0], [unit._replace(guessed=False)]) == tables[0]
