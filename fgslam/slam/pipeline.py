@@ -349,9 +349,8 @@ class SlamPipeline:
         """Whether the features that the map does not explain move rigidly, too."""
         if self.watch is None:
             return
-        association = matched.association
-        known = association.partners(len(features)), association.known
-        self.tracker.other_motion.look(index, features, known, matched.ego_motion, stats.wTc)
+        of_scene = matched.association, matched.ego_motion
+        self.tracker.other_motion.look(index, features, *of_scene, stats.wTc)
 
     @timed("calibrate")
     def _calibrate(self, increment: Increment, stats: UpdateStats) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.geometry import (
     compose_covariance,
     in_front,
@@ -521,42 +521,10 @@ _FRAMES, _WINDOW = 3, 10  # so many of so many described frames: no wrong match,
 _LARGEST = 300  # features of each frame that are matched: the time is that of their square
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Unexplained(Rows):
-    """Features (n,) of a frame that no landmark known before it explains.
-
-    ``ids`` are the landmarks that they began, -1 for none; ``positions`` (n, 3) and
-    ``covariances`` (n, 3, 3) in the world, by that frame's pose, metres.
-    """
-
-    ids: IntArray
-    descriptors: ByteArray
-    positions: FloatArray
-    covariances: FloatArray
-
-    @staticmethod
-    def none() -> _Unexplained:
-        return _Unexplained(
-            np.empty(0, np.int64),
-            np.empty((0, 128), np.uint8),
-            np.empty((0, 3)),
-            np.empty((0, 3, 3)),
-        )
-
-    @staticmethod
-    def of(features: StereoFeatures, ids: IntArray, wTc: FloatArray) -> _Unexplained:
-        return _Unexplained(
-            ids,
-            features.descriptors,
-            transform_to_world(wTc, features.position),
-            rotate_covariances(wTc[:3, :3], features.position_covariance),
-        )
-
-
 class OtherMotion:
     """Remembers the frames of a drive that show a second rigid motion."""
 
-    _before: Kept[_Unexplained]
+    _before: Kept[tuple[IntArray, StereoFeatures]]
     _latest: Kept[deque[tuple[int, float]]]
     _contradicting: Kept[dict[int, float]]
 
@@ -565,7 +533,7 @@ class OtherMotion:
         self._solver = solver
         self._resection = Resection(solver)
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
-        self._before = _Unexplained.none()
+        self._before = np.empty(0, np.int64), StereoFeatures.empty()
         self._latest = deque(maxlen=_WINDOW)
         self._contradicting = {}
 
@@ -573,7 +541,7 @@ class OtherMotion:
         self,
         index: int,
         features: StereoFeatures,
-        known: tuple[IntArray, IntArray],
+        association: Association,
         tracking: EgoMotion,
         wTc: FloatArray,
     ) -> None:
@@ -582,12 +550,11 @@ class OtherMotion:
         Args:
             index: its number.
             features: (n,) those found in every image.
-            known: (n,) the landmark that each is taken for, -1 for none, and the identities of
-                those among them that were known before.
+            association: what they make of the landmarks.
             tracking: its pose, as it was tracked.
             wTc: (4, 4) the same after the update, from which the next frame is predicted.
         """
-        partners, old = known
+        partners, old = association.partners(len(features)), association.known
         left = np.flatnonzero(~np.isin(partners, old))
         left = left[np.argsort(-features.scale[left], kind="stable")[:_LARGEST]]
         share = self._share(features, left, old, tracking) if tracking.status.measured else 0.0
@@ -596,9 +563,12 @@ class OtherMotion:
         if len(seen) >= _FRAMES:
             self._contradicting.update(seen)
         followed = tracking.status.measured or tracking.status is EgoMotionStatus.FIRST
-        self._before = _Unexplained.none()
-        if followed:
-            self._before = _Unexplained.of(features.select(left), partners[left], wTc)
+        left = left if followed else left[:0]
+        rest = features.select(left)
+        where = transform_to_world(wTc, rest.position)
+        turned = rotate_covariances(wTc[:3, :3], rest.position_covariance)
+        there = replace(rest, position=where, position_covariance=turned)
+        self._before = partners[left], there  # what no landmark explained, and which it began
 
     def remarks(self) -> tuple[Remark, ...]:
         """On the frames with two motions; none where there are none."""
@@ -611,13 +581,14 @@ class OtherMotion:
         self, features: StereoFeatures, left: IntArray, old: IntArray, tracking: EgoMotion
     ) -> float:
         """Matches that agree with another motion over those of the pose; zero where none is."""
-        before = self._before.select(~np.isin(self._before.ids, old))
+        ids, before = self._before
+        before = before.select(~np.isin(ids, old))
         if min(len(left), len(before)) < _FEWEST:
             return 0.0
         i, j = mutual_nearest(features.descriptors[left], before.descriptors)
         problem = PoseProblem(
-            before.positions[j],
-            before.covariances[j],
+            before.position[j],
+            before.position_covariance[j],
             features.measurement[left[i]],
             features.measurement_covariance[left[i]],
         )
@@ -627,11 +598,9 @@ class OtherMotion:
         rest = problem.select(against)
         found = self._resection.solve(rest)
         agreeing = int(found.inliers.sum()) if found.status.measured else 0
-        if agreeing < _FEWEST or not self._certain(found, rest, len(problem)):
+        apart = places(rest.measurement[found.inliers, :2], self._solver.farthest)
+        size = sample_size(self._solver.floor)
+        by_chance = log_false_poses(len(problem), apart, size, self._by_chance)
+        if agreeing < _FEWEST or by_chance > math.log(FALSE_POSES):
             return 0.0
         return agreeing / max(int(tracking.inliers.sum()), 1)
-
-    def _certain(self, found: EgoMotion, problem: PoseProblem, matches: int) -> bool:
-        agreeing = places(problem.measurement[found.inliers, :2], self._solver.farthest)
-        size = sample_size(self._solver.floor)
-        return log_false_poses(matches, agreeing, size, self._by_chance) <= math.log(FALSE_POSES)
