@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -84,12 +84,14 @@ class SelfCalibration:
 
     _known: Kept[RigFilter]
     _recent: Kept[list[_Window]]
+    _quietest: Kept[float]
     _applied: Kept[FloatArray]
     steps: Kept[list[CalibrationStep]]
     windows: Kept[int]
     moved_at: Kept[list[int]]
     moved_before: Kept[bool]
     suspected: Kept[int | None]
+    _open: Kept[FloatArray]
     _seen: Kept[int]
     _frames: Kept[list[tuple[FloatArray, Observations]]]
     _last_time: Kept[float | None]
@@ -111,6 +113,7 @@ class SelfCalibration:
         self._begun = (begun or RigFilter.none)(self._unknowns)
         self._known = self._begun
         self._recent = []
+        self._quietest = np.inf  # spread of a window
         self.found = self._known.weighed(self._unknowns)
         """As known now, and what of it is worth applying."""
         self.steps = []
@@ -123,6 +126,7 @@ class SelfCalibration:
         """Whether it was found to have moved since the drives that it began with."""
         self.suspected = None
         """Frame from which on the rig seems to be another one, while that is undecided."""
+        self._open = np.zeros(6)  # a frame's motion by one rig, seen from that by two
         self._applied = self.found.applied.values
         self._seen = 0
         self._sigma = pixel_sigma
@@ -194,7 +198,7 @@ class SelfCalibration:
         since = 0.0 if self._last_time is None else timestamp - self._last_time
         self._last_time = timestamp
         of, before = self._unknowns, self._known.faded(since / _DRIFT_S)
-        alignment = RigAlignment(of, frames, self._sigma, before.shake)
+        alignment = RigAlignment(of, frames, self._sigma, before.shake, self._quietest)
         evidence = alignment.evidence(before.values(of), before.precision(of))
         if evidence is None:
             return
@@ -204,6 +208,7 @@ class SelfCalibration:
         if unlikely:  # linearised where the window itself would go
             other = before.without_terms(of)
             evidence = alignment.evidence(other.values(of), other.precision(of)) or evidence
+        self._quietest = min(self._quietest, evidence.spread)
         window = _Window(before, evidence, self._seen - len(frames))
         self._recent = [*self._recent[1 - _RECENT :], window]
         self._known = judged.after(of, evidence)
@@ -235,14 +240,21 @@ class SelfCalibration:
         terms = slice(self._unknowns.terms)
         sure[0] *= self._recent[0].before.information[terms, terms].any()  # else nothing was known
         first, self.suspected = int(np.argmax(sure)), None
+        self._open = np.zeros(6)
         if sure[first] <= likely:
             return None
+        self._open = self._recent[-1].evidence.moves @ moves[first].values
         if self._known.remembered and len(self._recent) == self.windows and sure[0] > likely:
             return -1
         if len(self._recent) - first >= _DECIDING:
             return first
         self.suspected = self._recent[first].first
         return None
+
+    def open_covariance(self) -> FloatArray:
+        """(6, 6) to be added to that of the last pose: one rig or two, until poses follow that."""
+        off = (self._seen - self.moves[-1]) * self._open if self.moves else self._open
+        return 0.5 * np.outer(off, off)
 
     def _moved(self, first: int) -> RigCorrection:
         """By how much the rig differs from a recent window on, if all before are of one rig."""
@@ -529,6 +541,9 @@ class WeighedCorrection:
 
 _KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motion's
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
+_SCENE = 4.0
+"""Times the least spread of a window: errors twice as large are the scene's. A blurred image has
+ten to eighty times that, and says so much less: else it seems to be of a rig that was knocked."""
 _LANDMARKS = 300  # of a window: all that a street shows, 500, make it surer by a tenth
 _CELLS = np.array([8, 6])  # of the image, across and down, over which they are spread
 _DAMPING = 1e-6
@@ -551,12 +566,16 @@ class RigEvidence:
         pull: (n,) ``information @ best``, where this window alone would go.
         shaken: squared shifts of the frames' rows, added up, as expected: radians^2.
         frames: how many they are.
+        spread: median of the squared residuals, in stated variances.
+        moves: (6, p) by which a unit of each term moves the last pose, per frame of the window.
     """
 
     information: FloatArray
     pull: FloatArray
     shaken: float
     frames: int
+    spread: float = 0.0
+    moves: FloatArray = field(default_factory=lambda: np.zeros((6, 0)))
 
     @staticmethod
     def total(of: RigUnknowns, some: Sequence[RigEvidence]) -> RigEvidence:
@@ -613,11 +632,14 @@ class RigAlignment:
         frames: Sequence[tuple[FloatArray, Observations]],
         pixel_sigma: float,
         shake: float,
+        quietest: float,
     ) -> None:
         """Frames are (wTc, what the ego-motion accepted), in order of time.
 
-        ``shake``: deviation of a frame's shifts, radians.
+        ``shake``: deviation of a frame's shifts, radians. ``quietest``: least spread of a window
+        before, in stated variances.
         """
+        self._quietest = quietest
         self._of, self._rig, self._sigma, self._shake = of, of.rig, pixel_sigma, shake
         rig = of.rig
         self._shaken = [k * len(TERMS) + term for k in range(rig.cameras - 1) for term in _SHAKEN]
@@ -662,10 +684,16 @@ class RigAlignment:
         information = (information + information.T) / 2.0
         score = -(normal.gradient[-n:] - mixed.T @ gain[:, -1])
         pull = score + information @ state.rig
-        rows = np.arange(6 + _ROW, state.shakes.shape[1] + 6, len(_SHAKEN))
-        at = (6 + state.shakes.shape[1]) * np.arange(len(self._poses))[:, None] + rows
+        own = 6 + state.shakes.shape[1]
+        rows = np.arange(6 + _ROW, own, len(_SHAKEN))
+        at = own * np.arange(len(self._poses))[:, None] + rows
         shifts = state.shakes[:, rows - 6] ** 2 + np.diagonal(spread)[at - 6]
-        return RigEvidence(information, pull, float(shifts.sum()), shifts.size)
+        squared = float(np.median((self._predicted(state).residual ** 2).sum(axis=1)))
+        noise = squared / self._quietest
+        noise = noise if noise > _SCENE else 1.0
+        shaken = float(shifts.sum())
+        moves = -gain[-own : 6 - own, : self._of.terms] / (len(self._poses) - 1)
+        return RigEvidence(information / noise, pull / noise, shaken, shifts.size, squared, moves)
 
     # ----------------------------------------------------------------------------------------
 

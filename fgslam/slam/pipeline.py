@@ -129,6 +129,8 @@ class SlamPipeline:
             self._look_for_other_motion(index, features, matched, stats)
         self._calibrate(increment, stats)
         mixed = stats.covariance + self.witnesses.open_covariance(stats.wTc)
+        if self.calibration is not None:
+            mixed = mixed + self.calibration.open_covariance()
         stats = dataclasses.replace(stats, covariance=mixed)
         times = self.watch_of_frame.ms
         return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)

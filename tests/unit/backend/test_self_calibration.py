@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, replace
 
@@ -413,14 +414,30 @@ def test_a_loose_camera_is_named_and_a_knock_of_the_first_frames_is_found() -> N
     road, itself = Road(frames=42), SelfCalibration(RIG, SIGMA_PX)
     turned = errors(yaw=np.deg2rad(0.25))
     straight, aside = (drive(road, by, np.random.default_rng(3)) for by in (errors(), turned))
-    seems = []
+    seems, opened = [], []
     for k, wTc in enumerate(poses_of(road)):
         itself.observe((aside if WINDOW <= k < 4 * WINDOW else straight)[k], wTc)
         seems.append([one.code for one in itself.remarks()])
+        opened.append(math.sqrt(np.trace(itself.open_covariance()[3:, 3:])))
+    # A quarter of a degree is 1.6 px: a tenth of the disparities here, and so of the way.
+    assert not any(opened[: 2 * WINDOW - 1])
+    assert opened[4 * WINDOW - 1] == 0.0
+    assert 0.02 * WINDOW < opened[2 * WINDOW - 1] < opened[3 * WINDOW - 1] < 0.4 * 2 * WINDOW
     assert seems[2 * WINDOW - 1] == ["rig_doubted"]
     assert seems[3 * WINDOW - 1] == ["rig_moved"]
     assert seems[-1] == ["rig_loose"]
     assert itself.moved_at == [WINDOW, 4 * WINDOW]
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_images_that_become_noisy_are_not_of_a_rig_that_was_knocked(seed: int) -> None:
+    sharp, blurred = (Road(frames=30, points=300, noise=n) for n in (0.5, 5.0))
+    rng, itself = np.random.default_rng(seed), SelfCalibration(RIG, SIGMA_PX)
+    before, after = (drive(one, errors(), rng) for one in (sharp, blurred))
+    for k, wTc in enumerate(poses_of(sharp)):
+        itself.observe((before if k < 2 * WINDOW else after)[k], wTc)
+    assert not itself.moves
+    assert image_error(itself.found.applied, errors()) < 0.1
 
 
 def test_a_state_taken_within_a_window_goes_on_with_the_same_bits() -> None:
