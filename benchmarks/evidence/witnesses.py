@@ -17,7 +17,7 @@ import fgslam as fg
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.geometry import inverse, pose, rotation_angle, se3_exp, so3_exp
+from fgslam.core.geometry import inverse, pose, rotation_angle, se3_exp, so3_exp, so3_log
 from fgslam.core.sensors import CameraRig, Odometry, compose_odometry
 from fgslam.core.types import Remark
 from fgslam.runs.report import located
@@ -297,6 +297,11 @@ def images_of(change: Callable[[Drive, int], tuple[Image, Image]]) -> Fault:
     ])  # fmt: skip
 
 
+def stated(fault: Fault) -> Fault:
+    """A fault of the rig, whose calibration is then not exact, even of rendered images."""
+    return lambda drive: fault(replace(drive, rig=replace(drive.rig, exact=False)))
+
+
 def turned(yaw: float, pitch: float, roll: float, drifts: bool = False) -> Fault:
     """The left camera turned against the right one, degrees."""
 
@@ -309,7 +314,7 @@ def turned(yaw: float, pitch: float, roll: float, drifts: bool = False) -> Fault
         warped = cv2.warpPerspective(left, warp, size, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(warped, np.uint8), right
 
-    return images_of(change)
+    return stated(images_of(change))
 
 
 def body(
@@ -400,6 +405,47 @@ def _darker(drive: Drive, k: int) -> tuple[Image, Image]:
     return (left // 2).astype(np.uint8), right
 
 
+def _blurred(drive: Drive, k: int) -> tuple[Image, Image]:
+    left, right = drive.images[k]
+    return np.asarray(cv2.GaussianBlur(left, (0, 0), 3.0), np.uint8), right
+
+
+def _torn(drive: Drive, k: int) -> tuple[Image, Image]:
+    (left, right), (before, _) = drive.images[k], drive.images[k - 1]
+    half = len(left) // 2
+    return np.concatenate([before[:half], left[half:]]), right
+
+
+def _reflecting(drive: Drive, k: int) -> tuple[Image, Image]:
+    """A pane over the left half of the view, in which the right half is reflected."""
+    left, right = drive.images[k]
+    pane = np.arange(left.shape[1]) < left.shape[1] // 2
+    return tuple(  # type: ignore[return-value]
+        _grey(np.where(pane, 0.4 * one + 0.6 * other[:, ::-1], one))
+        for one, other in ((left, right), (right, left))
+    )
+
+
+def _out_of_order(drive: Drive, k: int) -> tuple[Image, Image]:
+    return drive.images[min(k + (1, 1, -2)[k % 3], len(drive) - 1)]
+
+
+def late(drive: Drive) -> Drive:
+    """Odometry of the step before."""
+    return replace(drive, odometry=[None, *drive.odometry[1:2], *drive.odometry[1:-1]])
+
+
+def turning(scale: float) -> Fault:
+    """Odometry whose turns are so many times the true ones."""
+
+    def wrong(step: Odometry) -> Odometry:
+        motion = step.motion.copy()
+        motion[:3, :3] = so3_exp(scale * so3_log(motion[:3, :3]))
+        return replace(step, motion=motion)
+
+    return lambda drive: replace(drive, odometry=[s and wrong(s) for s in drive.odometry])
+
+
 def _jumping(*cameras: int) -> Fault:
     """Exposure that jumps from frame to frame, in these images."""
 
@@ -441,7 +487,24 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "yaw knocked 0.25": (turned(0.25, 0.0, 0.0), ("road", "lab")),
     "yaw drifts 0.4": (turned(0.4, 0.0, 0.0, drifts=True), ("road", "lab")),
     "pitch, roll 0.3": (turned(0.0, 0.3, 0.3), ("road", "lab")),
-    "principal point 8 px": (off_centre, ("road", "lab")),
+    "principal point 8 px": (stated(off_centre), ("road", "lab")),
+    "left one blurred": (images_of(_blurred), ("road", "lab")),
+    "left one torn": (images_of(_torn), ("road", "lab")),
+    "exchanged": (images_of(lambda d, k: (d.images[k][1], d.images[k][0])), ("road", "lab")),
+    "mirrored": (
+        images_of(lambda d, k: tuple(one[:, ::-1].copy() for one in d.images[k])),  # type: ignore[arg-type,return-value]
+        ("road", "lab"),
+    ),
+    "every third repeated": (
+        images_of(lambda d, k: d.images[k - (k % 3 == 0)]),
+        ("road", "lab"),
+    ),
+    "out of order": (images_of(_out_of_order), ("road", "lab")),
+    "reflection": (images_of(_reflecting), ("road", "lab")),
+    "poster carried along": (body(0.0, 0.3, 0.6, 0.5), ("road", "lab")),
+    "odometry late": (late, ("road", "lab")),
+    "turns x 0.9": (turning(0.9), ("road", "lab", "room")),
+    "wheels x 0.8": (wheels(0.8), ("road", "lab", "room")),
 }
 """Faults, and the recordings that each is tried on."""
 
