@@ -260,15 +260,14 @@ class SelfCalibration:
         """By how much the rig differs from a recent window on, if all before are of one rig."""
         of, start, p = self._unknowns, self._recent[0].before, self._unknowns.terms
         factor = start.noise_factor(of)
-        before, after = (
-            RigEvidence.total(of, [one.evidence for one in some])
-            for some in (self._recent[:first], self._recent[first:])
-        )
-        one = start.precision(of) + (before.information + after.information) / factor
-        mixed = after.information[:p] / factor
+        shown = [one.evidence for one in self._recent]
+        every, after = (sum(e.information for e in some) for some in (shown, shown[first:]))
+        pulls, later = (sum(e.pull for e in some) for some in (shown, shown[first:]))
+        one = start.precision(of) + every / factor
+        mixed = np.asarray(after)[:p] / factor
         own = mixed[:, :p] + of.prior(start.field_px)[:p, :p]
         joint = np.block([[own, mixed], [mixed.T, one]])
-        pull = np.append(after.pull[:p] / factor, start.pull + (before.pull + after.pull) / factor)
+        pull = np.append(np.asarray(later)[:p] / factor, start.pull + pulls / factor)
         covariance = np.asarray(np.linalg.inv(joint))
         return RigCorrection(of.rig, (covariance @ pull)[:p], covariance[:p, :p])
 
@@ -576,14 +575,6 @@ class RigEvidence:
     frames: int
     spread: float = 0.0
     moves: FloatArray = field(default_factory=lambda: np.zeros((6, 0)))
-
-    @staticmethod
-    def total(of: RigUnknowns, some: Sequence[RigEvidence]) -> RigEvidence:
-        """Of windows, together."""
-        information, pull = np.zeros((of.size, of.size)), np.zeros(of.size)
-        for one in some:
-            information, pull = information + one.information, pull + one.pull
-        return RigEvidence(information, pull, 0.0, 0)
 
 
 @dataclass(slots=True, eq=False)
