@@ -217,7 +217,7 @@ def test_an_image_of_another_size_is_reported(
     config = refused(tmp_path, {"kind": "panoramas", "path": str(folder)})
     status = main(monkeypatch, "run", config, "--out", tmp_path / "run")
     assert status == 2
-    assert "all must have one size" in capfd.readouterr().err.splitlines()[-1]
+    assert "restore the right file" in capfd.readouterr().err.splitlines()[-1]
 
 
 def test_an_unknown_task_and_an_unknown_route_are_reported(

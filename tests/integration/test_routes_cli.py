@@ -79,7 +79,7 @@ def test_a_route_is_taught_with_the_reason_of_each_path_image(taught: Path, data
     path = PathMemory.load(taught)
     assert path.camera == textured_room_camera()
     assert len(path) == len(rows) < 9
-    other = "view_4a.png has 200x91 pixels, the first one 301x91; all must have one size"
+    other = "view_4a.png is 200x91 but the calibration states 301x91"
     assert other in (data / "taught" / "report.html").read_text(encoding="utf-8")
     assert (rows[0]["reason"], rows[-1]["reason"]) == ("start", "end")
     numbers = json.loads((data / "taught" / "metrics.json").read_text(encoding="utf-8"))
@@ -277,13 +277,13 @@ def test_another_place_is_said(
     assert main(monkeypatch, "follow", taught, other, "--out", tmp_path / "run") == 1
     said = " ".join(capfd.readouterr().out.split())
     assert "Not one of 2 images is recognised on the route" in said
-    assert "2.png has 200x91 pixels, the first one 301x91" in said
+    assert "2.png is 200x91 but the calibration states 301x91" in said
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "damaged or of another size" in page
     rows = rows_of(tmp_path / "run" / "follow.csv")
     assert [row["name"] for row in rows] == ["0.png", "1.png", "2.png"]
     assert (rows[2]["image"], rows[2]["time_s"], rows[2]["state"]) == ("2", "0.200000000", "")
-    assert "2.png has 200x91 pixels, the first one 301x91" in rows[2]["refusal"]
+    assert "2.png is 200x91 but the calibration states 301x91" in rows[2]["refusal"]
 
 
 def film_of(path: Path, count: int) -> Path:
