@@ -673,13 +673,8 @@ def _info_of(settings: BagSettings, bag: Bag, topic: str, rectified: bool) -> In
     whole = (info["image_width"], info["image_height"])
     sent = ((width or whole[0]) // across, (height or whole[1]) // down)
     if bag.size == sent != whole:
-        part = np.array(
-            [
-                [1.0 / across, 0.0, (0.5 - x) / across - 0.5],
-                [0.0, 1.0 / down, (0.5 - y) / down - 0.5],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        part = np.diag([1.0 / across, 1.0 / down, 1.0])
+        part[:2, 2] = (0.5 - x) / across - 0.5, (0.5 - y) / down - 0.5
         matrices = {
             name: {"data": (part @ np.reshape(info[name]["data"], (3, -1))).ravel().tolist()}
             for name in ("camera_matrix", "projection_matrix")

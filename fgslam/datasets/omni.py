@@ -121,17 +121,11 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
     chosen = select_frames(frames.count, settings, settings.path)
     first = frames.load(int(chosen[0]))
     numbers, times, timed, _ = moments_of([frames], frames.rate, stated=False)
-    recording = OmniRecording(
-        name=path.stem,
-        identity=recording_identity([path], []),
-        camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), path.parent),
-        ids=numbers[:, 0],
-        names=tuple(f"frame {k}" for k in range(frames.count)),
-        timestamps=times,
-        notes=(*frames.notes, *timed),
-        load_image=frames.load,
-    )
-    return recording.select(chosen)
+    camera = make_camera(settings.camera, (first.shape[1], first.shape[0]), path.parent)
+    identity, names = recording_identity([path], []), [f"frame {k}" for k in range(frames.count)]
+    shown = numbers[:, 0], tuple(names), times, frames.load
+    notes = (*frames.notes, *timed)
+    return OmniRecording(path.stem, identity, camera, *shown, notes=notes).select(chosen)
 
 
 def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
@@ -218,24 +212,22 @@ def open_pictures(settings: PanoramasSettings | OmniPathSettings) -> OmniRecordi
         return reduction(require_size(image, f"picture {paths[i]}", *size))
 
     written = written_stamps(paths, [root])
+    stamps = np.full(len(paths), np.nan) if written is None else written.seconds
+    identity = recording_identity([table] if listed else [], paths)
+    camera = make_camera(settings.camera, reduced, root)
+    ids, names = ids_of([path.stem for path in paths]), tuple(path.name for path in paths)
     recording = OmniRecording(
-        name=root.resolve().name,
-        identity=recording_identity([table] if listed else [], paths),
-        camera=make_camera(settings.camera, reduced, root),
-        ids=ids_of([path.stem for path in paths]),
-        names=tuple(path.name for path in paths),
-        timestamps=np.full(len(paths), np.nan) if written is None else written.seconds,
-        load_image=load,
+        root.resolve().name, identity, camera, ids, names, stamps, load_image=load
     )
     if listed is not None:
         # Plans lie next to poses.csv, too; pictures that no row names are looked for in panos/.
         inside = inner.iterdir() if inner.is_dir() else ()
         extra = [p for p in inside if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
         note = f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}"
-        _, ids, poses, rooms = listed
+        _, own, poses, rooms = listed
         recording = replace(
             recording,
-            ids=np.array(ids, np.int64),
+            ids=np.array(own, np.int64),
             poses=np.array(poses, np.float64),
             rooms=tuple(rooms) if any(rooms) else None,
             notes=(note,) if extra else (),

@@ -170,27 +170,17 @@ def smaller(recording: Recording, scale: float) -> Recording:
     def resized(read: DepthLoader, index: int) -> Depth:
         return np.asarray(cv2.resize(read(index), size, interpolation=cv2.INTER_NEAREST))
 
+    # Whole pixels are at their centres: the image reaches from -0.5.
+    cx, cy = x * (rig.cx + 0.5) - 0.5, y * (rig.cy + 0.5) - 0.5
+    note = f"images of {rig.width}x{rig.height} are made {size[0]}x{size[1]}"
+    smaller_margins = (cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in margins)
     return replace(
         recording,
-        rig=replace(
-            rig,
-            width=size[0],
-            height=size[1],
-            fx=x * rig.fx,
-            fy=y * rig.fy,
-            # Whole pixels are at their centres: the image reaches from -0.5.
-            cx=x * (rig.cx + 0.5) - 0.5,
-            cy=y * (rig.cy + 0.5) - 0.5,
-        ),
-        margins=tuple(
-            scale * cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in margins
-        ),
+        rig=replace(rig, width=size[0], height=size[1], fx=x * rig.fx, fy=y * rig.fy, cx=cx, cy=cy),
+        margins=tuple(scale * each for each in smaller_margins),
         load_images=load,
         load_depth=recording.load_depth and partial(resized, recording.load_depth),
-        notes=(
-            f"images of {rig.width}x{rig.height} are made {size[0]}x{size[1]}",
-            *recording.notes,
-        ),
+        notes=(note, *recording.notes),
     )
 
 

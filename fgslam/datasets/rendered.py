@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -196,22 +197,21 @@ class RenderedLabSequence:
 
     def depth(self, i: int) -> FloatArray:
         """(height, width) depth Z in metres of the reference camera's pixels; NaN when blocked."""
-        index = self._index(i)
-        if is_blocked(self._settings.effects, index):
-            return np.full((self._rig.height, self._rig.width), np.nan)
-        world = self._open_world()
-        return world.depth(self._body[index] @ self._rig.bTc, self._bodies(world, index))
+        return np.asarray(self._true_pixels(i, World.depth, np.nan), np.float64)
 
     def object_ids(self, i: int) -> IntArray:
         """(height, width) index into ``object_names`` of the reference camera's pixels.
 
         -1 where the cover blocks the view.
         """
+        return np.asarray(self._true_pixels(i, World.object_ids, -1), np.int64)
+
+    def _true_pixels(self, i: int, seen: Callable[..., Any], blocked: float) -> Any:
         index = self._index(i)
         if is_blocked(self._settings.effects, index):
-            return np.full((self._rig.height, self._rig.width), -1, dtype=np.int64)
+            return np.full((self._rig.height, self._rig.width), blocked)
         world = self._open_world()
-        return world.object_ids(self._body[index] @ self._rig.bTc, self._bodies(world, index))
+        return seen(world, self._body[index] @ self._rig.bTc, self._bodies(world, index))
 
     # ---------------------------------------------------------------- rendering
 
