@@ -480,7 +480,7 @@ def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
 
 
 PLAIN = KernelSettings("none")
-_SLOW = 0.3  # of the last step's gain: beyond, a kept system has become another
+_FAR = 0.3  # of the cost: a step that gains as much has made another system of a kept one
 _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
 
@@ -693,7 +693,7 @@ class Descent:
     """Steps towards the minimum, Gauss and Newton's or damped.
 
     Near the minimum the system hardly changes from step to step: where it is kept, its factor,
-    which is most of the work, serves on.
+    which is most of the work, serves on, for conjugate gradients.
     """
 
     def __init__(self, keeps: bool = True) -> None:
@@ -711,15 +711,14 @@ class Descent:
             graph: what is minimised.
             cost: at the state.
             state: before.
-            last_gain: by how much the step before lowered the cost; a kept system goes on as long
-                as each step gains a small part of that.
+            last_gain: by how much the step before lowered the cost; infinite: there was none.
         """
         system = graph.linear(state)
-        if self._held is not None:
+        if self._held is not None and not _FAR * cost < last_gain < np.inf:
             found = self._kept(graph, state, system, self._held)
-            if found is not None and 0.0 <= cost - found[0] <= _SLOW * last_gain:
+            if found is not None and found[0] <= cost:
                 return found
-            self._held = None
+        self._held = None
         return self._damping.step(cost, partial(self._tried, graph, state, system))
 
     def _kept(

@@ -8,7 +8,7 @@ poses that saw it. Where landmarks are few and seen long, they stay in that syst
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -572,6 +572,8 @@ def _backward(root: FloatArray, right: FloatArray) -> FloatArray:
 
 
 _SEGMENT = 8  # poses of a drive that are eliminated at once, before landmarks
+_MOST_TURNS, _EXACT = 12, 0.03  # of conjugate gradients; of the step's length in its deviations
+_LEAST = 1e-300
 _PAIRS_AT_ONCE = 1 << 16
 """Of poses that see one landmark: a bound for memory."""
 
@@ -604,6 +606,18 @@ class LinearSystem:
     def columns(self) -> int:
         """How many rows and columns are landmarks'."""
         return 3 * len(self.landmark_keys)
+
+    def times(self) -> Callable[[FloatArray], FloatArray]:
+        """The information's product with (3m + 6n, c)."""
+        transposed = self.coupling.T
+
+        def product(x: FloatArray) -> FloatArray:
+            points, poses = x[: self.columns], x[self.columns :]
+            own = (self.landmarks @ points.reshape(-1, 3, x.shape[1])).reshape(points.shape)
+            own += transposed @ poses + self.links @ points
+            return np.concatenate([own, self.poses @ poses + self.coupling @ points])
+
+        return product
 
     @property
     def in_pairs(self) -> bsr_matrix:
@@ -665,11 +679,13 @@ class GraphMarginals:
         system: the graph.
         inverse: (m, 3, 3) of each landmark's own block; None where poses are eliminated first.
         factor: of the poses' information (6n, 6n), reduced; or of all of it, in pairs.
+        near: the factor is that of another system, much like this one.
     """
 
     system: LinearSystem
     inverse: FloatArray | None
     factor: BlockCholesky
+    near: bool = False
 
     @staticmethod
     def of(system: LinearSystem, landmarks_first: bool = True) -> GraphMarginals:
@@ -698,7 +714,7 @@ class GraphMarginals:
             EstimatorError: a landmark is not determined by its observations.
         """
         inverse = None if self.inverse is None else _own_inverses(system)
-        return GraphMarginals(system, inverse, self.factor)
+        return GraphMarginals(system, inverse, self.factor, near=True)
 
     @property
     def _before(self) -> int:
@@ -710,7 +726,29 @@ class GraphMarginals:
         return self.solve(self.system.gradient[:, None])[:, 0]
 
     def solve(self, gradients: FloatArray) -> FloatArray:
-        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
+        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held.
+
+        Raises:
+            EstimatorError: the factor is of a system too unlike this one.
+        """
+        if not self.near:
+            return self._by_factor(gradients)
+        times, x, left = self.system.times(), np.zeros_like(gradients), -gradients
+        ahead = along = -self._by_factor(left)
+        size = first = (left * ahead).sum(axis=0)
+        for _ in range(_MOST_TURNS):
+            pull = times(along)
+            length = size / np.maximum((along * pull).sum(axis=0), _LEAST)
+            x, left = x + length * along, left - length * pull
+            ahead = -self._by_factor(left)
+            size, before = (left * ahead).sum(axis=0), size
+            if (size <= _EXACT**2 * first).all():
+                return x
+            along = ahead + size / np.maximum(before, _LEAST) * along
+        raise EstimatorError("no step by the factor of another system")
+
+    def _by_factor(self, gradients: FloatArray) -> FloatArray:
+        """The same of the system whose factor it is, the other's landmarks as they are."""
         s, m, c = self.system, self.system.columns, gradients.shape[1]
         if self.inverse is None:
             none = np.zeros((m % 2 * 3, c))  # of the landmark that makes the last pair
