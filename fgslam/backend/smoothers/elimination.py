@@ -743,7 +743,7 @@ class GraphMarginals:
             ahead = -self._by_factor(left)
             size, before = (left * ahead).sum(axis=0), size
             if (size <= _EXACT**2 * first).all():
-                return x
+                return np.asarray(x)
             along = ahead + size / np.maximum(before, _LEAST) * along
         raise EstimatorError("no step by the factor of another system")
 

@@ -520,7 +520,8 @@ class WindowPrior:
         corner = self.corner[np.ix_(rest, rest)] - gone[:, :-1].T @ gone[:, :-1]
         gradient = self.corner_gradient[rest] - gone[:, :-1].T @ gone[:, -1]
         back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
-        coupling = np.concatenate([self.coupling[:, :, :q], self.coupling[:, :, q:] @ back], axis=2)
+        flat = self.coupling.reshape(-1, r)  # one product: three rows a landmark are slow
+        coupling = np.hstack([flat[:, :q], flat[:, q:] @ back]).reshape(len(self.own), 3, -1)
         order = np.r_[len(own) : len(own) + q, : len(own), len(own) + q : len(own) + len(rest)]
         whole = np.block([[np.eye(len(own)), own[:, :-1]], [own[:, :-1].T, corner]])
         return self._with_corner(
