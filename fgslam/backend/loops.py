@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,6 +44,7 @@ FREE_RAD, FREE_M = 3.0, 30.0
 (a frame's own landmarks know the pose a thousand times better), yet the graph stays solvable."""
 FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
 """(6, 6) covariance of such a step."""
+_GAP = 5.0  # usual intervals between frames
 _PART = 6  # landmarks by which a later frame can be placed
 _TIED_BY = 10  # landmarks of an old place that hold a frame there
 _OLD = 5  # submaps
@@ -70,6 +72,19 @@ def starts_new_part(increment: Increment, tracking: EgoMotion) -> bool:
     its stated uncertainty.
     """
     return guessed(increment, tracking) and int(increment.observations.is_new.sum()) >= _PART
+
+
+def unknown_step_covariance(increment: Increment, times: Sequence[float]) -> FloatArray:
+    """(6, 6) of the step to a frame that nothing ties to those before, at ``times`` (n,).
+
+    After a gap in time it is the guess's, of the last velocity and its spread: that what was seen
+    before is out of view refutes nothing. Else the camera may have been carried anywhere.
+    """
+    guess = increment.odometry
+    if guess is None or increment.relocalised or len(times) < 2:
+        return FREE
+    gap = increment.timestamp - times[-1] > _GAP * float(np.median(np.diff(times)))
+    return guess.covariance if gap else FREE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

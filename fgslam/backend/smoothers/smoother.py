@@ -22,7 +22,12 @@ import numpy as np
 from fgslam.backend.considered import ConsiderCovariance, symmetric_root
 from fgslam.backend.filters.filtered import placed, require_finite
 from fgslam.backend.filters.kalman import LandmarkKalman, motions_by_lag
-from fgslam.backend.loops import CLOSURE_FACTOR, FREE, Constraint, starts_new_part
+from fgslam.backend.loops import (
+    CLOSURE_FACTOR,
+    Constraint,
+    starts_new_part,
+    unknown_step_covariance,
+)
 from fgslam.backend.persistence import learn_from
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
@@ -144,15 +149,19 @@ class Smoother:
     # -- its steps -----------------------------------------------------------------------------
 
     def _unknown_step(self, increment: Increment, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior, or not at all: free to be any other.
+        """The step to a frame found without a prior, or not at all: any, but after a gap in time.
 
         But a gyroscope has felt even how the camera was carried.
         """
         before, turn = self.tracker.predict(None).wTc, increment.odometry
-        motion, covariance = inverse(before) @ tracking.wTc, FREE
+        times = [one.increment.timestamp for one in self.inputs]
+        motion, covariance = (
+            inverse(before) @ tracking.wTc,
+            unknown_step_covariance(increment, times),
+        )
         if turn is None or not turn.turned:
             return Odometry(motion, covariance, measured=False)
-        motion[:3, :3], covariance = turn.motion[:3, :3], FREE.copy()
+        motion[:3, :3], covariance = turn.motion[:3, :3], covariance.copy()
         covariance[:3, :3] = turn.covariance[:3, :3]
         return Odometry(motion, covariance, measured=False, turned=True, bias=turn.bias)
 

@@ -36,6 +36,7 @@ from fgslam.backend.loops import (
     rigid_motions,
     rotated,
     transported,
+    unknown_step_covariance,
 )
 from fgslam.backend.loops import (
     FREE as UNMEASURED,
@@ -619,3 +620,15 @@ def test_relocalised_robot_is_where_its_landmarks_are(name: str) -> None:
     assert np.linalg.norm(online[20:], axis=1).max() < 0.05
     final = estimator.estimate().trajectory.poses[:, :3, 3] - poses[:, :3, 3]
     assert np.linalg.norm(final, axis=1).max() < 0.05
+
+
+def test_only_a_gap_in_time_leaves_the_guess_what_it_is() -> None:
+    """Half a second without frames at ten a second; a frame in time was carried anywhere."""
+    times = [0.0, 0.1, 0.2, 0.3]
+    guess = Odometry(np.eye(4), 0.04 * np.eye(6), measured=False)
+    for late, expected in ((0.4, UNMEASURED), (0.9, guess.covariance)):
+        increment = Increment.of(4, late, guess)
+        np.testing.assert_array_equal(unknown_step_covariance(increment, times), expected)
+        found = replace(increment, relocalised=True)
+        np.testing.assert_array_equal(unknown_step_covariance(found, times), UNMEASURED)
+    np.testing.assert_array_equal(unknown_step_covariance(increment, times[:1]), UNMEASURED)
