@@ -521,7 +521,8 @@ class WindowPrior:
         gradient = self.corner_gradient[rest] - gone[:, :-1].T @ gone[:, -1]
         back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
         flat = self.coupling.reshape(-1, r)  # one product: three rows a landmark are slow
-        coupling = np.hstack([flat[:, :q], flat[:, q:] @ back]).reshape(len(self.own), 3, -1)
+        coupling = np.hstack([flat[:, :q], flat[:, q:] @ back])
+        coupling = coupling.reshape(len(self.own), 3, q + len(own))
         order = np.r_[len(own) : len(own) + q, : len(own), len(own) + q : len(own) + len(rest)]
         whole = np.block([[np.eye(len(own)), own[:, :-1]], [own[:, :-1].T, corner]])
         return self._with_corner(
