@@ -120,6 +120,17 @@ class InvariantEkfSettings(JointFilterSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class FastSlamSettings(NamedSettings):
+    """FastSLAM 2.0: particles of paths, in each the paper's filter a landmark."""
+
+    family: ClassVar[Family] = "filter"
+    kind: Literal["fast_slam"] = "fast_slam"
+    particles: Count = Field(default=30, description="paths; time and memory are in proportion")
+    seed: Index = Field(default=0, description="of the draws; not the run's seed")
+    floor: FloorMode = Field(default="auto", description="as of `ekf`")
+
+
+@dataclass(frozen=True, config=STRICT)
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
@@ -203,6 +214,7 @@ EstimatorSettings: TypeAlias = Annotated[
     | LandmarkKalmanGraphSettings
     | EkfSettings
     | InvariantEkfSettings
+    | FastSlamSettings
     | FixedLagSettings
     | Isam2Settings
     | SlidingWindowSettings

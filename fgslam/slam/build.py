@@ -166,6 +166,9 @@ _MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], 
     "invariant_ekf": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.filters.invariant_ekf"
     ).InvariantEkf(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    "fast_slam": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.filters.fast_slam"
+    ).FastSlam(rig, own, make_floor(rig, own.floor, ego.dof), prior),
     "fixed_lag": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.smoothers.lag"
     ).fixed_lag_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
