@@ -265,11 +265,14 @@ class SlamPipeline:
             initialises = self.places.maps_on
         judged = self.witnesses.judge(now._replace(features=stereo), tracked)
         tracked = judged.tracked
-        relocalised = judged.by_images or (located and judged.verdict == "agreed")
+        status = tracked.ego_motion.status
+        by_images = status in (EgoMotionStatus.RELOCALISED, EgoMotionStatus.CONTRADICTED)
+        relocalised = by_images or (located and judged.verdict == "agreed")
+        settled = judged.verdict in ("agreed", "images")  # what is missing is so to both witnesses
         image = whole.images[0]
         if self.key_frames is not None:
             tracked = spread(tracked, stereo)
-        association = self.tracker.associate(tracked, stereo, image, initialises, judged.settled)
+        association = self.tracker.associate(tracked, stereo, image, initialises, settled)
         if len(judged.ended):
             self.tracker.database.drop(judged.ended)
             pruned = np.union1d(association.pruned_ids, judged.ended)

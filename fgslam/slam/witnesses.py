@@ -677,17 +677,6 @@ class Judged(NamedTuple):
     step: Odometry | None
     ended: IntArray = np.empty(0, np.int64)
 
-    @property
-    def by_images(self) -> bool:
-        """Whether the pose is one that its odometry contradicts."""
-        status = self.tracked.ego_motion.status
-        return status in (EgoMotionStatus.RELOCALISED, EgoMotionStatus.CONTRADICTED)
-
-    @property
-    def settled(self) -> bool:
-        """Whether what the frame does not show is missing: to both witnesses."""
-        return self.verdict in ("agreed", "images")
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contradiction:

@@ -64,6 +64,7 @@ _SETTLED = 1e-5  # radians and metres: far below what any measurement resolves
 _NEGATIVE = 1e-10  # of the largest variance: rounding of a pose covariance that is singular
 _SLAB = 192  # rows updated at once: large enough for the product's speed, small enough for cache
 _GROWTH = 1.2
+_NO_MOTIONS = "covariances of motions are not known: the filter keeps the newest pose alone"
 
 
 def correct(
@@ -497,7 +498,7 @@ class FullEkf:
 
     def estimate(self) -> Estimate:
         """Trajectory as filtered, and the map."""
-        remarks = []
+        remarks = [_NO_MOTIONS]
         if self._gated:
             remarks.append(
                 f"{self._gated} of {self._matched} matches left out: innovation beyond "

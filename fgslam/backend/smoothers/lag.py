@@ -62,6 +62,9 @@ from fgslam.factors.motion import pose_prior
 # Fixed-lag smoothing: poses and landmarks older than the lag are marginalised
 
 
+_NO_MOTIONS = "covariances of motions between final poses are not known: past the lag none is kept"
+
+
 def fixed_lag_smoother(
     sensor: CameraRig, settings: FixedLagSettings, floor: Floor, prior: Prediction
 ) -> LagSmoother:
@@ -163,6 +166,7 @@ class FixedLagSolver:
             covariances,
             dict(zip(inside, places, strict=True)),
             dict(zip(inside, found, strict=True)),
+            (_NO_MOTIONS,),
         )
 
     # ----------------------------------------------------------------------------------------
