@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from fgslam.backend.considered import fused, pixels_of
 from fgslam.backend.loops import home_changes, rotated, transported
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
@@ -39,6 +40,7 @@ from fgslam.core.arrays import (
     Rows,
     chi_square_quantile,
 )
+from fgslam.core.correction import displacements, term_names
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     adjoint,
@@ -79,11 +81,13 @@ class Look:
     """Observations (k,) as they are linearised now: rows of their poses and landmarks, and theirs.
 
     Residuals are those of the estimate, weights (in the rows) those of where it is linearised.
+    ``pulls`` (k, m, 1 + q) are the residuals, then their derivatives by the rig's correction.
     """
 
     pose: IntArray
     point: IntArray
     rows: LinearRows
+    pulls: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -343,13 +347,15 @@ class WindowPrior:
     """Half of ``z H z`` plus ``g z``, z the change since the point where it was linearised.
 
     z is in this order: r hidden numbers, the tangents of the window's poses (6n), and landmarks.
+    Gradients have 1 + q columns: g, then its derivatives by the rig's correction, so that what has
+    left follows a rig that calibrates itself as if it were measured again.
 
     Attributes:
         corner: (r + 6n, r + 6n) H of hidden numbers and poses.
-        corner_gradient: (r + 6n,) g of the same.
+        corner_gradient: (r + 6n, 1 + q) g of the same.
         variables: (p,) landmark variables that it speaks of, ascending.
         own: (p, 3, 3) H of each landmark.
-        gradient: (p, 3) g of the same.
+        gradient: (p, 3, 1 + q) g of the same.
         coupling: (p, 3, r) H between landmarks and hidden numbers.
         points: (p, 3) where the landmarks were linearised.
         kept: so many of the hidden numbers, the first, stay what they are.
@@ -365,15 +371,15 @@ class WindowPrior:
     kept: int = 0
 
     @staticmethod
-    def none(poses: int = 0) -> WindowPrior:
-        """Says nothing about a window of some poses."""
+    def none(terms: int, poses: int = 0) -> WindowPrior:
+        """Says nothing about a window of some poses, by a rig's correction of so many terms."""
         size = 6 * poses
         return WindowPrior(
             np.zeros((size, size)),
-            np.zeros(size),
+            np.zeros((size, 1 + terms)),
             np.empty(0, np.int64),
             np.empty((0, 3, 3)),
-            np.empty((0, 3)),
+            np.empty((0, 3, 1 + terms)),
             np.empty((0, 3, 0)),
             np.empty((0, 3)),
         )
@@ -385,9 +391,21 @@ class WindowPrior:
 
     def with_pose(self) -> WindowPrior:
         """The same with one pose more in the window, of which it measures nothing."""
-        return self._with_corner(
-            np.pad(self.corner, (0, 6)), np.pad(self.corner_gradient, (0, 6)), self.coupling
-        )
+        gradient = np.pad(self.corner_gradient, ((0, 6), (0, 0)))
+        return self._with_corner(np.pad(self.corner, (0, 6)), gradient, self.coupling)
+
+    def recalibrated(self, values: FloatArray) -> WindowPrior:
+        """Of the measurements as they are with the rig's correction changed by ``values`` (q,)."""
+        corner, gradient = self.corner_gradient.copy(), self.gradient.copy()
+        corner[:, 0] += corner[:, 1:] @ values
+        gradient[:, :, 0] += gradient[:, :, 1:] @ values
+        return dataclasses.replace(self, corner_gradient=corner, gradient=gradient)
+
+    def with_terms_known(self) -> WindowPrior:
+        """The same whatever becomes of the rig's correction."""
+        corner, gradient = self.corner_gradient.copy(), self.gradient.copy()
+        corner[:, 1:], gradient[:, :, 1:] = 0.0, 0.0
+        return dataclasses.replace(self, corner_gradient=corner, gradient=gradient)
 
     def with_leaving(self, poses: int, corner: FloatArray, gradient: FloatArray) -> WindowPrior:
         """The first poses hidden, and this added to the corner and its gradient."""
@@ -399,7 +417,7 @@ class WindowPrior:
         at = [self.kept] * 6
         corner = np.insert(np.insert(self.corner, at, 0.0, axis=0), at, 0.0, axis=1)
         coupling = np.insert(self.coupling, at, 0.0, axis=2)
-        new = self._with_corner(corner, np.insert(self.corner_gradient, at, 0.0), coupling)
+        new = self._with_corner(corner, np.insert(self.corner_gradient, at, 0.0, axis=0), coupling)
         return dataclasses.replace(new, kept=self.kept + 6)
 
     def with_known(
@@ -427,7 +445,7 @@ class WindowPrior:
         """With a quadratic (k, k) and (k,) more over some of the corner."""
         corner, whole = self.corner.copy(), self.corner_gradient.copy()
         corner[np.ix_(columns, columns)] += information
-        whole[columns] += gradient
+        whole[columns, 0] += gradient
         return self._with_corner(corner, whole, self.coupling)
 
     def without_place(self, place: int) -> WindowPrior:
@@ -441,15 +459,15 @@ class WindowPrior:
         )
         return dataclasses.replace(found, kept=self.kept - 6)
 
-    def with_rows(self, landmark: IntArray, columns: IntArray, rows: LinearRows) -> WindowPrior:
+    def with_rows(self, landmark: IntArray, columns: IntArray, look: Look) -> WindowPrior:
         """With what observations (k,) measured of landmarks, by row, and of hidden poses.
 
         Args:
             landmark: (k,) rows of the landmarks.
             columns: (k,) first hidden number of the pose that saw it.
-            rows: linearised and weighed; what they say of poses alone is not added.
+            look: linearised and weighed; what they say of poses alone is not added.
         """
-        turned = np.swapaxes(rows.by_point, 1, 2)
+        rows, turned = look.rows, np.swapaxes(look.rows.by_point, 1, 2)
         p, coupling = len(self.variables), self.coupling.copy()
         at, own = columns[:, None] + np.arange(6), turned @ rows.by_point
         if rows.residual.shape[1] < 3:  # such a block has no inverse
@@ -458,7 +476,7 @@ class WindowPrior:
         return dataclasses.replace(
             self,
             own=self.own + summed(landmark, own, p),
-            gradient=self.gradient + summed(landmark, products(turned, rows.residual), p),
+            gradient=self.gradient + summed(landmark, turned @ look.pulls, p),
             coupling=coupling,
         )
 
@@ -468,7 +486,7 @@ class WindowPrior:
         order = np.argsort(every, kind="stable")
         more = len(variables)
         own = np.concatenate([self.own, np.zeros((more, 3, 3))])[order]
-        gradient = np.concatenate([self.gradient, np.zeros((more, 3))])[order]
+        gradient = np.concatenate([self.gradient, np.zeros((more, *self.gradient.shape[1:]))])[order]
         coupling = np.concatenate([self.coupling, np.zeros((more, 3, self.hidden))])[order]
         at = np.concatenate([self.points, points])[order]
         return dataclasses.replace(
@@ -489,7 +507,7 @@ class WindowPrior:
         rows = 3 * len(own)
         less = coupling.reshape(rows, r).T @ gain.reshape(rows, r)
         corner[:r, :r] -= 0.5 * (less + less.T)
-        corner_gradient[:r] -= gain.reshape(rows, r).T @ gradient.ravel()
+        corner_gradient[:r] -= gain.reshape(rows, r).T @ gradient.reshape(rows, gradient.shape[2])
         left = ~gone
         return dataclasses.replace(
             self._with_corner(corner, corner_gradient, self.coupling[left]),
@@ -517,17 +535,18 @@ class WindowPrior:
         turned = turn.T @ solve_triangular(factor, right, lower=True, check_finite=False)
         stays = strength > _UNCOUPLED
         gone, own = turned[~stays], turned[stays]
-        corner = self.corner[np.ix_(rest, rest)] - gone[:, :-1].T @ gone[:, :-1]
-        gradient = self.corner_gradient[rest] - gone[:, :-1].T @ gone[:, -1]
+        (gone, gone_pull), (own, own_pull) = (np.split(of, [len(rest)], axis=1) for of in (gone, own))
+        corner = self.corner[np.ix_(rest, rest)] - gone.T @ gone
+        gradient = self.corner_gradient[rest] - gone.T @ gone_pull
         back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
         flat = self.coupling.reshape(-1, r)  # one product: three rows a landmark are slow
         coupling = np.hstack([flat[:, :q], flat[:, q:] @ back])
         coupling = coupling.reshape(len(self.own), 3, q + len(own))
         order = np.r_[len(own) : len(own) + q, : len(own), len(own) + q : len(own) + len(rest)]
-        whole = np.block([[np.eye(len(own)), own[:, :-1]], [own[:, :-1].T, corner]])
+        whole = np.block([[np.eye(len(own)), own], [own.T, corner]])
         return self._with_corner(
             whole[np.ix_(order, order)],
-            np.concatenate([own[:, -1], gradient])[order],
+            np.concatenate([own_pull, gradient])[order],
             coupling,
         )
 
@@ -579,7 +598,9 @@ class Window:
         self.observed = Sightings(none, none, np.empty((0, 3)), np.empty((0, 3, 3)), sensor)
         self.measured: dict[str, Sightings] = {}
         self.factors = gtsam.NonlinearFactorGraph()
-        self.prior = WindowPrior.none()
+        self._terms = 0 if sensor.exact else len(term_names(sensor))
+        self._rig_since = 0  # first frame of the rig as it is now
+        self.prior = WindowPrior.none(self._terms)
         self.places: dict[int, FloatArray] = {}
         self._anchors: dict[int, FloatArray] = {}
         self._shift = np.empty((0, 6))
@@ -614,8 +635,13 @@ class Window:
         self.measured = by_kind([*self.measured.values(), new])
 
     def remeasure(self, change: RigChange) -> None:
-        """Corrects the observations of the frames that the change is of."""
+        """Corrects the observations of the frames that the change is of, and what has left."""
         seen = self.observed
+        if change.since == self._rig_since:
+            self.prior = self.prior.recalibrated(change.values)
+        else:  # what has left was measured by another rig
+            self.prior = self.prior.with_terms_known()
+        self._rig_since = change.since
         late = (seen.poses >= change.since)[:, None]
         again = np.where(late, change.measured(seen.measured), seen.measured)
         self.observed = dataclasses.replace(seen, measured=again)
@@ -683,8 +709,11 @@ class Window:
         """(p,) rows of the landmarks that the prior speaks of."""
         return np.searchsorted(self.landmarks.variables, self.prior.variables).astype(np.int64)
 
-    def linearise(self, observed: Sightings) -> Look:
-        """Some of the window's observations; a kernel weighs each where it is linearised."""
+    def linearise(self, observed: Sightings, leaving: bool = False) -> Look:
+        """Some of the window's observations; a kernel weighs each where it is linearised.
+
+        Of those that are ``leaving`` with their derivatives by the rig's correction.
+        """
         seen, kernel = observed.at_rows(self.frames, self.landmarks.variables), self.kernel
         pose, point, (at, places) = seen.poses, seen.points, self._where_linearised()
         rows = seen.look(at, places)
@@ -693,7 +722,15 @@ class Window:
         weight = kernel_weights(name, kernel.width, squared)
         residual = rows.residual + products(rows.by_point, (self.landmarks.points - places)[point])
         residual += products(rows.by_pose, self._shift[pose])
-        return Look(pose, point, weighed(dataclasses.replace(rows, residual=residual), weight))
+        rows = weighed(dataclasses.replace(rows, residual=residual), weight)
+        pulls = rows.residual[:, :, None]
+        if leaving:
+            pulls = np.pad(pulls, ((0, 0), (0, 0), (0, self._terms)))
+            if self._terms and seen.model is self.observed.model:
+                shift = fused(seen.model, displacements(seen.model, pixels_of(seen.model, seen.measured)))
+                root = np.sqrt(weight * (observed.poses >= self._rig_since))
+                pulls[:, :, 1:] = root[:, None, None] * (seen.roots @ shift)
+        return Look(pose, point, rows, pulls)
 
     def _where_linearised(self) -> tuple[FloatArray, FloatArray]:
         """Poses and points, those on which the prior depends where they were when it first did."""
@@ -719,11 +756,11 @@ class Window:
             gradient += summed(point, products(turned, rows.residual), m)
         by = weak.points[tied] - p.points
         own[tied] += p.own
-        gradient[tied] += p.gradient + products(p.own, by)
-        corner, right = self._corner_of(evaluated, n, r)
+        gradient[tied] += p.gradient[:, :, 0] + products(p.own, by)
+        corner, (right,) = self._corner_of(evaluated, n, r)
         self._add_factors(corner, right, self.factors, self._shift)
         corner += p.corner
-        right += p.corner_gradient + p.corner[:, r:] @ self._shift.ravel()
+        right += p.corner_gradient[:, 0] + p.corner[:, r:] @ self._shift.ravel()
         right[:r] += p.coupling.reshape(by.size, r).T @ by.ravel()
         return Equations(
             corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, p.coupling
@@ -735,14 +772,15 @@ class Window:
         return [self.observed, *self.measured.values()]
 
     def _corner_of(self, evaluated: list[Look], n: int, r: int) -> tuple[FloatArray, FloatArray]:
-        """What observations say of poses alone: (r + 6n, r + 6n) and (r + 6n,)."""
-        corner, right = np.zeros((r + 6 * n, r + 6 * n)), np.zeros(r + 6 * n)
+        """What observations say of poses alone: (r + 6n, r + 6n), and pulls by column (., r + 6n)."""
+        columns = evaluated[0].pulls.shape[2]
+        corner, right = np.zeros((r + 6 * n, r + 6 * n)), np.zeros((columns, r + 6 * n))
         at = r + 6 * np.arange(n)[:, None] + np.arange(6)
         for look in evaluated:
             pose, rows = look.pose, look.rows
             turned = np.swapaxes(rows.by_pose, 1, 2)
             corner[at[:, :, None], at[:, None, :]] += summed(pose, turned @ rows.by_pose, n)
-            right[at] += summed(pose, products(turned, rows.residual), n)
+            right[:, at] += np.moveaxis(summed(pose, turned @ look.pulls, n), 2, 0)
         return corner, right
 
     def _add_factors(
@@ -782,7 +820,7 @@ class Window:
             factor = self.factors.at(row)
             earliest = min(number(key) for key in list(factor.keys()))
             (touched if earliest < first else untouched).add(factor)
-        gone = [self.linearise(one.select(one.poses < first)) for one in self._every]
+        gone = [self.linearise(one.select(one.poses < first), leaving=True) for one in self._every]
         self._into_prior(gone, touched, leaving)
         self.factors = untouched
         self._keep(lambda one: one.poses >= first)
@@ -804,11 +842,11 @@ class Window:
         prior = self.prior.with_landmarks(new, points[np.searchsorted(variables, new)])
         n, r = len(self.frames), prior.hidden
         corner, right = self._corner_of(there, n, r)
-        self._add_factors(corner, right, factors, np.zeros_like(self._shift))
-        prior = prior.with_leaving(leaving, corner, right)
+        self._add_factors(corner, right[0], factors, np.zeros_like(self._shift))
+        prior = prior.with_leaving(leaving, corner, right.T)
         for look in there:
             tied = np.searchsorted(prior.variables, variables[look.point])
-            prior = prior.with_rows(tied, r + 6 * look.pose, look.rows)
+            prior = prior.with_rows(tied, r + 6 * look.pose, look)
         self.prior = prior
         for key in factors.keyVector():
             row = self.frames.index(number(key))
@@ -818,10 +856,12 @@ class Window:
         """Those that count, with residuals as they would be where the derivatives were taken."""
         counts: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
         pose, point, rows = look.pose[counts], look.point[counts], look.rows.select(counts)
+        pulls = look.pulls[counts]
         moved = (self.landmarks.points - self._where_linearised()[1])[point]
         residual = rows.residual - products(rows.by_point, moved)
         residual -= products(rows.by_pose, self._shift[pose])
-        return Look(pose, point, dataclasses.replace(rows, residual=residual))
+        pulls[:, :, 0] = residual
+        return Look(pose, point, rows, pulls)
 
     def _drop_poses(self, leaving: int) -> None:
         for frame in self.frames[:leaving]:
@@ -840,7 +880,8 @@ class Window:
         own = prior.own + np.where(leaving[:, None, None], weak.information[tied], 0.0)
         off = prior.points - weak.mean[tied]
         pull = products(weak.information[tied], off)
-        gradient = prior.gradient + np.where(leaving[:, None], pull, 0.0)
+        gradient = prior.gradient.copy()
+        gradient[:, :, 0] += np.where(leaving[:, None], pull, 0.0)
         prior = dataclasses.replace(prior, own=own, gradient=gradient)
         self.prior = prior.without(leaving)
         self.landmarks = weak.select(~gone)
@@ -913,7 +954,7 @@ class Window:
         points = transform_to_world(by, weak.points)
         mean = np.where(stays, weak.mean, transform_to_world(by, weak.mean))
         self.landmarks = Landmarks(weak.variables, points, mean, turned)
-        self.prior, self._least_hidden = WindowPrior.none(len(self.frames)), 0
+        self.prior, self._least_hidden = WindowPrior.none(self._terms, len(self.frames)), 0
         self.places = {}
         self._anchors, self._shift = {}, np.zeros((len(self.frames), 6))
         self.factors.add(prior)
