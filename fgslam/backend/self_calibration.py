@@ -8,13 +8,13 @@ disagree. Nothing is known of the truth. Derived in docs/derivations/cameras.md.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from fgslam.backend.considered import fused, pixels_of
 from fgslam.core.arrays import BoolArray, FloatArray, chi_square_quantile
 from fgslam.core.correction import (
     BASELINE_TERMS,
@@ -191,13 +191,6 @@ class SelfCalibration:
         if passes:
             return
         self._frames.append((wTc, increment.kept))
-        if not self.windows and str(len(self._frames)) in os.environ.get("EARLY", "").split(","):
-            of, before = self._unknowns, self._known
-            alignment = RigAlignment(of, self._frames, self._sigma, before.shake)
-            evidence = alignment.evidence(before.values(of), before.precision(of))
-            if evidence is not None:
-                self.found = self._held(before.judged(of, evidence)[1].after(of, evidence).weighed(of))
-                self._applied = self.found.applied.values
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []
             self._take(frames, increment.timestamp)
@@ -846,6 +839,11 @@ class RigAlignment:
 # from the pose that saw it last: to first order, as corrections are fractions of a disparity.
 
 
+def terms_in_measurements(rig: CameraRig, measurement: FloatArray) -> FloatArray:
+    """(k, 3, p) by which a unit of each term displaces measurements (k, 3) of all images."""
+    return fused(rig, displacements(rig, pixels_of(rig, measurement)))
+
+
 _LEAST_SHARE = 0.5  # of a disparity that is left: below, it is no first-order change
 
 
@@ -866,10 +864,7 @@ class RigChange:
 
     def measured(self, measurement: FloatArray) -> FloatArray:
         """Measurements (k, 3) (column, row, disparity) of all images, by the new correction."""
-        ratio, cameras = vertical_to_horizontal(self.rig), self.rig.cameras
-        pixels = measurement @ pixel_model(cameras, ratio).T
-        moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
-        return np.asarray(measurement - moved @ rig_map(self.rig).T)
+        return np.asarray(measurement - terms_in_measurements(self.rig, measurement) @ self.values)
 
     def moved(self, poses: FloatArray, positions: FloatArray) -> FloatArray:
         """Landmarks (k, 3) in the world, each measured again from a pose (k, 4, 4) that saw it.

@@ -11,7 +11,6 @@ measured, as batch's. Derivation: docs/derivations/smoothers.md.
 from __future__ import annotations
 
 import dataclasses
-import os
 from typing import Any, ClassVar
 
 import gtsam
@@ -369,11 +368,14 @@ class SlidingWindowSolver(WholeGraphSolver):
         return Smoothed(self.window.values(), last, self.window.frames[0], earlier=earlier)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Looks again at the window; what has left it moves with where it was seen last."""
+        """Looks again at the window; what has left it moves with where it was seen last.
+
+        It is solved with the next frame.
+        """
         super().recalibrate(change)
         self._let_go()
-        if os.environ.get("ATONCE"):
-            self._solved_at = min(self._solved_at, len(self.poses) - self._settings.update_every)
+        due = len(self.poses) - self._settings.update_every
+        self._solved_at = min(self._solved_at, due)  # with the next frame
         self.window.remeasure(change)
         self._take_in()  # the builder has corrected these already
         frames, variables, *_ = self.builder.kept_observed()

@@ -18,9 +18,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from fgslam.backend.considered import fused, pixels_of
 from fgslam.backend.loops import home_changes, rotated, transported
-from fgslam.backend.self_calibration import RigChange
+from fgslam.backend.self_calibration import RigChange, terms_in_measurements
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.admission import LEAST_PARALLAX
 from fgslam.backend.smoothers.bundle import Sightings, by_kind
@@ -40,7 +39,7 @@ from fgslam.core.arrays import (
     Rows,
     chi_square_quantile,
 )
-from fgslam.core.correction import displacements, term_names
+from fgslam.core.correction import term_names
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     adjoint,
@@ -394,17 +393,17 @@ class WindowPrior:
         gradient = np.pad(self.corner_gradient, ((0, 6), (0, 0)))
         return self._with_corner(np.pad(self.corner, (0, 6)), gradient, self.coupling)
 
-    def recalibrated(self, values: FloatArray) -> WindowPrior:
-        """Of the measurements as they are with the rig's correction changed by ``values`` (q,)."""
-        corner, gradient = self.corner_gradient.copy(), self.gradient.copy()
-        corner[:, 0] += corner[:, 1:] @ values
-        gradient[:, :, 0] += gradient[:, :, 1:] @ values
-        return dataclasses.replace(self, corner_gradient=corner, gradient=gradient)
+    def recalibrated(self, values: FloatArray, same: bool) -> WindowPrior:
+        """Of the measurements as they are with the rig's correction changed by ``values`` (q,).
 
-    def with_terms_known(self) -> WindowPrior:
-        """The same whatever becomes of the rig's correction."""
+        That of another rig than it is the ``same`` no longer depends on the correction.
+        """
         corner, gradient = self.corner_gradient.copy(), self.gradient.copy()
-        corner[:, 1:], gradient[:, :, 1:] = 0.0, 0.0
+        for pull in (corner, gradient):
+            if same:
+                pull[..., 0] += pull[..., 1:] @ values
+            else:
+                pull[..., 1:] = 0.0
         return dataclasses.replace(self, corner_gradient=corner, gradient=gradient)
 
     def with_leaving(self, poses: int, corner: FloatArray, gradient: FloatArray) -> WindowPrior:
@@ -486,14 +485,14 @@ class WindowPrior:
         order = np.argsort(every, kind="stable")
         more = len(variables)
         own = np.concatenate([self.own, np.zeros((more, 3, 3))])[order]
-        gradient = np.concatenate([self.gradient, np.zeros((more, *self.gradient.shape[1:]))])[order]
+        gradient = np.concatenate([self.gradient, np.zeros((more, *self.gradient.shape[1:]))])
         coupling = np.concatenate([self.coupling, np.zeros((more, 3, self.hidden))])[order]
         at = np.concatenate([self.points, points])[order]
         return dataclasses.replace(
             self,
             variables=every[order],
             own=own,
-            gradient=gradient,
+            gradient=gradient[order],
             coupling=coupling,
             points=at,
         )
@@ -535,7 +534,9 @@ class WindowPrior:
         turned = turn.T @ solve_triangular(factor, right, lower=True, check_finite=False)
         stays = strength > _UNCOUPLED
         gone, own = turned[~stays], turned[stays]
-        (gone, gone_pull), (own, own_pull) = (np.split(of, [len(rest)], axis=1) for of in (gone, own))
+        (gone, gone_pull), (own, own_pull) = (
+            np.split(of, [len(rest)], axis=1) for of in (gone, own)
+        )
         corner = self.corner[np.ix_(rest, rest)] - gone.T @ gone
         gradient = self.corner_gradient[rest] - gone.T @ gone_pull
         back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
@@ -637,10 +638,8 @@ class Window:
     def remeasure(self, change: RigChange) -> None:
         """Corrects the observations of the frames that the change is of, and what has left."""
         seen = self.observed
-        if change.since == self._rig_since:
-            self.prior = self.prior.recalibrated(change.values)
-        else:  # what has left was measured by another rig
-            self.prior = self.prior.with_terms_known()
+        same = change.since == self._rig_since
+        self.prior = self.prior.recalibrated(change.values, same)
         self._rig_since = change.since
         late = (seen.poses >= change.since)[:, None]
         again = np.where(late, change.measured(seen.measured), seen.measured)
@@ -724,11 +723,11 @@ class Window:
         residual += products(rows.by_pose, self._shift[pose])
         rows = weighed(dataclasses.replace(rows, residual=residual), weight)
         pulls = rows.residual[:, :, None]
-        if leaving:
+        if leaving and self._terms:
             pulls = np.pad(pulls, ((0, 0), (0, 0), (0, self._terms)))
-            if self._terms and seen.model is self.observed.model:
-                shift = fused(seen.model, displacements(seen.model, pixels_of(seen.model, seen.measured)))
+            if seen.model is self.observed.model:
                 root = np.sqrt(weight * (observed.poses >= self._rig_since))
+                shift = terms_in_measurements(seen.model, seen.measured)
                 pulls[:, :, 1:] = root[:, None, None] * (seen.roots @ shift)
         return Look(pose, point, rows, pulls)
 
@@ -772,7 +771,7 @@ class Window:
         return [self.observed, *self.measured.values()]
 
     def _corner_of(self, evaluated: list[Look], n: int, r: int) -> tuple[FloatArray, FloatArray]:
-        """What observations say of poses alone: (r + 6n, r + 6n), and pulls by column (., r + 6n)."""
+        """What observations say of poses alone: (r + 6n, r + 6n), and pulls (1 + q, r + 6n)."""
         columns = evaluated[0].pulls.shape[2]
         corner, right = np.zeros((r + 6 * n, r + 6 * n)), np.zeros((columns, r + 6 * n))
         at = r + 6 * np.arange(n)[:, None] + np.arange(6)

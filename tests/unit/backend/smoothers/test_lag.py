@@ -32,6 +32,7 @@ from fgslam.backend.smoothers.elimination import (
     UndeterminedError,
     UndeterminedLandmarkError,
 )
+from fgslam.backend.smoothers.graph import Smoothed
 from fgslam.backend.smoothers.lag import FixedLagSolver, SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother, Smoother
 from fgslam.backend.smoothers.window import HeldLandmarks, Solved, Window
@@ -398,6 +399,25 @@ def test_what_is_known_too_unevenly_is_begun_again_with_a_remark(
     assert len(failed) == 1
     assert max(off) < 0.03
     assert sum("begun again" in remark for remark in estimator.estimate().remarks) == 1
+
+
+def test_a_change_of_the_rig_is_solved_for_with_the_next_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drive, solved = drawn(3, frames=9), []
+    estimator = build(SlidingWindowSettings(window=6, update_every=4))
+    solve = SlidingWindowSolver.solve_if_due
+
+    def noted(own: SlidingWindowSolver, frame: int, closes_loop: bool) -> Smoothed | None:
+        found = solve(own, frame, closes_loop)
+        solved.extend([frame] if found else [])
+        return found
+
+    monkeypatch.setattr(SlidingWindowSolver, "solve_if_due", noted)
+    play(estimator, drive.increments[:4], FREE)
+    solver_of(estimator).recalibrate(RigChange(RIG, np.zeros(len(term_names(RIG)))))
+    play(estimator, drive.increments[4:], FREE)
+    assert solved == [0, 2, 4, 8]
 
 
 def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:

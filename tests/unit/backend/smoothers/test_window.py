@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from simulated import RIG, play
 from smoothing import FREE, build, drawn
 
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.elimination import Eliminated
 from fgslam.backend.smoothers.lag import FixedLagSolver
@@ -17,6 +18,7 @@ from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.window import LEAST, Landmarks, SeenAgain, Window
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.correction import term_names
 
 # ------------------------------------------------------------------------------------------
 # The fixed lag's window: what has left counts the same, once and where it was first linearised
@@ -25,14 +27,19 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 FRAMES, FIRST = 14, 8
 
 
-@pytest.fixture
-def window() -> Window:
+def whole_window() -> Window:
     """Of all frames; none has left."""
     estimator = build(FixedLagSettings(lag_frames=30))
     play(estimator, drawn(5, frames=FRAMES, points=80, prune_after=8).increments, FREE)
     assert isinstance(estimator, Smoother)
     assert isinstance(estimator.solver, FixedLagSolver)
     return estimator.solver.window
+
+
+@pytest.fixture
+def window() -> Window:
+    """Of all frames; none has left."""
+    return whole_window()
 
 
 def covariances(window: Window, variables: IntArray) -> FloatArray:
@@ -83,6 +90,36 @@ def test_the_place_of_rest_stays(window: Window) -> None:
     window.solve()
     np.testing.assert_allclose(window.poses, poses, rtol=0, atol=1e-4)
     np.testing.assert_allclose(window.landmarks.points, points, rtol=0, atol=1e-3)
+
+
+def test_what_has_left_follows_the_rig_as_if_it_were_measured_again(window: Window) -> None:
+    change, before, again = turned(1e-4), window.poses.copy(), whole_window()
+    again.remeasure(change)  # all of it
+    for one in (window, again):
+        for frame in range(1, FIRST + 1):
+            one.let_go_before(frame)
+    window.remeasure(change)  # some has left
+    for one in (window, again):
+        for _ in range(5):
+            one.solve()
+    moved = np.linalg.norm(again.poses[:, :3, 3] - before[FIRST:, :3, 3], axis=1)
+    apart = np.linalg.norm(again.poses[:, :3, 3] - window.poses[:, :3, 3], axis=1)
+    assert moved.min() > 1e-3
+    np.testing.assert_allclose(apart, 0.0, rtol=0, atol=0.1 * moved.min())
+
+
+def test_what_has_left_was_measured_by_the_rig_before_it_moved(window: Window) -> None:
+    window.let_go_before(FIRST)
+    before = window.prior
+    window.remeasure(turned(1e-4, since=FIRST))
+    np.testing.assert_array_equal(window.prior.gradient[..., 0], before.gradient[..., 0])
+    window.remeasure(turned(1e-4, since=FIRST))
+    np.testing.assert_array_equal(window.prior.gradient[..., 0], before.gradient[..., 0])
+
+
+def turned(radians: float, since: int = 0) -> RigChange:
+    """The left camera, in yaw."""
+    return RigChange(RIG, radians * (np.array(term_names(RIG)) == "left.yaw"), since)
 
 
 def test_an_observation_is_weighed_and_linearised_where_the_prior_was(window: Window) -> None:
