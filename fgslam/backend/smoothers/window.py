@@ -599,7 +599,7 @@ class Window:
         self.observed = Sightings(none, none, np.empty((0, 3)), np.empty((0, 3, 3)), sensor)
         self.measured: dict[str, Sightings] = {}
         self.factors = gtsam.NonlinearFactorGraph()
-        self._terms = 0 if sensor.exact else len(term_names(sensor))
+        self._terms = len(term_names(sensor))
         self._rig_since = 0  # first frame of the rig as it is now
         self.prior = WindowPrior.none(self._terms)
         self.places: dict[int, FloatArray] = {}
@@ -723,7 +723,7 @@ class Window:
         residual += products(rows.by_pose, self._shift[pose])
         rows = weighed(dataclasses.replace(rows, residual=residual), weight)
         pulls = rows.residual[:, :, None]
-        if leaving and self._terms:
+        if leaving:
             pulls = np.pad(pulls, ((0, 0), (0, 0), (0, self._terms)))
             if seen.model is self.observed.model:
                 root = np.sqrt(weight * (observed.poses >= self._rig_since))
