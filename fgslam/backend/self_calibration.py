@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import block_diag
 
-from fgslam.backend.considered import fused, pixels_of
 from fgslam.core.arrays import BoolArray, FloatArray, chi_square_quantile
 from fgslam.core.correction import (
     BASELINE_TERMS,
@@ -839,11 +838,6 @@ class RigAlignment:
 # from the pose that saw it last: to first order, as corrections are fractions of a disparity.
 
 
-def terms_in_measurements(rig: CameraRig, measurement: FloatArray) -> FloatArray:
-    """(k, 3, p) by which a unit of each term displaces measurements (k, 3) of all images."""
-    return fused(rig, displacements(rig, pixels_of(rig, measurement)))
-
-
 _LEAST_SHARE = 0.5  # of a disparity that is left: below, it is no first-order change
 
 
@@ -864,7 +858,10 @@ class RigChange:
 
     def measured(self, measurement: FloatArray) -> FloatArray:
         """Measurements (k, 3) (column, row, disparity) of all images, by the new correction."""
-        return np.asarray(measurement - terms_in_measurements(self.rig, measurement) @ self.values)
+        ratio, cameras = vertical_to_horizontal(self.rig), self.rig.cameras
+        pixels = measurement @ pixel_model(cameras, ratio).T
+        moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
+        return np.asarray(measurement - moved @ rig_map(self.rig).T)
 
     def moved(self, poses: FloatArray, positions: FloatArray) -> FloatArray:
         """Landmarks (k, 3) in the world, each measured again from a pose (k, 4, 4) that saw it.

@@ -18,8 +18,9 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from fgslam.backend.considered import fused, pixels_of
 from fgslam.backend.loops import home_changes, rotated, transported
-from fgslam.backend.self_calibration import RigChange, terms_in_measurements
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.admission import LEAST_PARALLAX
 from fgslam.backend.smoothers.bundle import Sightings, by_kind
@@ -39,7 +40,7 @@ from fgslam.core.arrays import (
     Rows,
     chi_square_quantile,
 )
-from fgslam.core.correction import term_names
+from fgslam.core.correction import displacements, term_names
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     adjoint,
@@ -727,7 +728,8 @@ class Window:
             pulls = np.pad(pulls, ((0, 0), (0, 0), (0, self._terms)))
             if seen.model is self.observed.model:
                 root = np.sqrt(weight * (observed.poses >= self._rig_since))
-                shift = terms_in_measurements(seen.model, seen.measured)
+                rig = seen.model
+                shift = fused(rig, displacements(rig, pixels_of(rig, seen.measured)))
                 pulls[:, :, 1:] = root[:, None, None] * (seen.roots @ shift)
         return Look(pose, point, rows, pulls)
 
