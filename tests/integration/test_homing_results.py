@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
+import mirror_door
+import numpy as np
 import pytest
 
+from fgslam.core.bearings import TwoViewVector
+from fgslam.core.geometry import between, wrap
+from fgslam.frontend.features.omni import OmniFeatureExtractor
+from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.homing.settings import DRIVING
 from fgslam.runs.config import load_experiment
 from fgslam.runs.run import run_experiment
 
@@ -62,3 +70,25 @@ def test_a_robot_beside_its_path_is_on_it_after_a_leg(tmp_path: Path) -> None:
     assert values["arrived"] == 2
     # The second target is the last: the robot stops where 7 % of the leg of 2 m are left.
     assert values["pass_distance_median_m"] <= 0.12
+
+
+def test_near_a_mirror_door_no_vector_is_surely_that_of_the_reflection() -> None:
+    """What the mirror shows moves consistently, too, by another motion.
+
+    A degree is what objects that occur twice, one of them behind the glass, may pull a direction.
+    """
+    extractor = OmniFeatureExtractor(mirror_door.CAMERA, DRIVING.features)
+    places = [(0.9, 3.1), (0.9, 4.2), (1.5, 3.6), (2.1, 2.8)]
+    poses = np.array([(x, y, 0.5 * k) for k, (x, y) in enumerate(places)])
+    seen = [extractor.extract(mirror_door.picture(pose, k)) for k, pose in enumerate(poses)]
+    settings, answered = DRIVING.homing_vector, 0
+    for a, b in itertools.permutations(range(len(poses)), 2):
+        rng = pair_generator(0, a, b)
+        vector, _ = vector_between(seen[a], seen[b], DRIVING.features.matching, settings, rng)
+        if isinstance(vector, TwoViewVector):
+            x, y, turn = between(poses[a], poses[b])
+            off = wrap(np.array([vector.direction - np.arctan2(y, x), vector.rotation - turn]))
+            sigma = np.sqrt(np.diag(vector.covariance))
+            assert (np.abs(off) <= np.maximum(3.0 * sigma, np.deg2rad(1.0))).all()
+            answered += 1
+    assert answered >= 6

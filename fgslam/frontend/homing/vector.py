@@ -703,11 +703,12 @@ _HYPOTHESES = 80  # that are scored again
 _PAIR_REFINED = 24  # of them are refined
 _WIDENED = 2.0  # times as far a candidate may lie from a hypothesis that is not refined
 
-_LEAST_SCORE = 35.0
+_LEAST_SCORE = 40.0
+_RIVAL = np.deg2rad(15.0)  # nearer, solutions are one: a wrong one has rivals at any angle beyond
 _LEAST_LEAD, _LEAST_LEAD_PART = 7.0, 0.09
 """Of the score over any different solution's, and as part of it. Scores grow with how alike places
-are to each other, and so do their differences. Among the 120 pairs of ``omni_home`` the largest
-lead of a wrong solution is 6, with a score of 35; in rendered rooms that hold the same furniture
+are to each other, and so do their differences. Among the 240 ordered pairs of ``omni_home`` as
+for driving the largest lead of a wrong one is 7.1, at a score of 37; in rooms of one furniture
 seven of ten wrong ones have less than 0.08 of scores up to 194."""
 
 
@@ -826,7 +827,7 @@ class SecondLook:
 
     def _differ(self, one: _Solution, other: _Solution) -> bool:
         apart = np.abs(wrap(one.refined.parameters[:2] - other.refined.parameters[:2]))
-        return bool(np.max(apart) > np.deg2rad(self._settings.rival_angle_deg))
+        return bool(np.max(apart) > min(_RIVAL, np.deg2rad(self._settings.rival_angle_deg)))
 
     def _covariance(self, best: _Solution, others: list[_Solution]) -> FloatArray:
         """(2, 2) of the best solution, widened by those near it with nearly as much evidence.
