@@ -589,17 +589,23 @@ class SampledErrors(ErrorColumns):
         if not self._off:
             drawn[..., self._count :] = self._drawn(noise)
             off = rows.by_pose @ self._pose_columns - drawn
-            off += rows.by_point @ self._of_map(ids) if len(ids) else 0.0
+            off += rows.by_point @ self._beside(ids, rows) if len(ids) else 0.0
             self._pose_columns = self._pose_columns - gain @ off.reshape(gain.shape[1], -1)
         return drawn
 
     def pull(self, gain: FloatArray, rows: LinearRows, ids: IntArray, drawn: FloatArray) -> None:
         """The landmarks of the same measurements follow them, by gains (k, 3, m)."""
         if not self._off:
-            columns = self._of_map(ids)
+            columns = self._beside(ids, rows)
             off = rows.by_pose @ self._pose_columns + rows.by_point @ columns - drawn
             at, known = self.rows(ids)
-            self._map["columns"][at[known]] = (columns - gain @ off)[known]
+            moved = (columns - gain @ off).reshape(len(ids), 3, -1)
+            self._map["columns"][at[known]] = moved[known]
+
+    def _beside(self, ids: IntArray, rows: LinearRows) -> FloatArray:
+        """(k, d, c) columns of the d numbers that each measurement is of."""
+        columns = self._of_map(ids)
+        return columns.reshape(-1, rows.by_point.shape[2], columns.shape[2])
 
     def begin(self, ids: IntArray, by_pose: FloatArray, covariances: FloatArray) -> None:
         """New landmarks (k,): world points by the pose (k, 3, 6), and their own errors."""

@@ -7,8 +7,8 @@ sensor (:class:`RelativePoint`): so filters and graphs hold the same information
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     GaussNewton,
     adjoint,
+    block_diagonal,
     congruence,
     inverse,
     transform_to_camera,
@@ -26,7 +27,13 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import CameraRig, Measured
 from fgslam.core.store import Kept
 from fgslam.core.types import Prediction
-from fgslam.factors.measurement import LandmarkModel, LinearRows, linearise, products
+from fgslam.factors.measurement import (
+    LandmarkModel,
+    LinearRows,
+    linearise,
+    products,
+    shifted,
+)
 
 _FIT = GaussNewton(iterations=20, converged=1e-6, longest=20.0, damping=1e-6)
 _FROM_M = (2.0, 8.0, 32.0)  # distances from which a point is looked for
@@ -57,11 +64,30 @@ def sensor_in_pose(rig: CameraRig, model: Any) -> FloatArray:
 
 
 def linearised(
-    rig: CameraRig, one: Measured, wTc: FloatArray, points: FloatArray | None = None
+    rig: CameraRig,
+    one: Measured,
+    wTc: FloatArray,
+    points: FloatArray | None = None,
+    nuisance: FloatArray | None = None,
 ) -> LinearRows:
-    """A frame's measurements at a pose ``wTc`` (4, 4), of points (k, 3) where they are of any."""
+    """A frame's measurements at a pose ``wTc`` (4, 4), of points (k, 3) where they are of any.
+
+    With nuisance parameters (3,) ``by_point`` is (k, m, 6), theirs behind the point.
+    """
     poses = np.broadcast_to(wTc, (len(one), 4, 4))
-    return linearise(one.model, poses, points, one.values, xTs=sensor_in_pose(rig, one.model))
+    rows = linearise(one.model, poses, points, one.values, xTs=sensor_in_pose(rig, one.model))
+    if nuisance is None:
+        return rows
+    by = shifted(one.model, one.values)
+    both = np.concatenate([rows.by_point, by], axis=2)
+    return replace(rows, residual=rows.residual + by @ nuisance, by_point=both)
+
+
+def nuisance_words(kind: str, values: FloatArray, variances: FloatArray) -> str:
+    """What nuisance parameters (3,) were found to be; those that there are not stay zero."""
+    each = zip(values.tolist(), np.sqrt(variances).tolist(), strict=True)
+    found = ", ".join(f"{value:.4g} (deviation {sigma:.2g})" for value, sigma in each if value)
+    return f"nuisance parameters of {kind}: {found}"
 
 
 def require_model(one: Measured, index: int) -> None:
@@ -120,14 +146,27 @@ class Waiting:
         """None yet."""
         self._singles = {}
         """By the landmarks' identities."""
-        self._models: dict[str, Any] = {}
+        self._models: dict[str, Known] = {}
 
-    def begin(self, rig: CameraRig, one: Measured, pose: Prediction, held: IntArray) -> Begun:
-        """Landmarks of a frame's measurements, of none that is ``held``, that now have a place."""
-        self._models[one.kind] = one.model
+    def begin(
+        self,
+        rig: CameraRig,
+        one: Measured,
+        pose: Prediction,
+        held: IntArray,
+        nuisance: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Begun:
+        """Landmarks of a frame's measurements, of none that is ``held``, that now have a place.
+
+        ``nuisance``: parameters (3,) of the sensor and their covariance (3, 3), if it has any.
+        """
         new, xTs = one.select(~np.isin(one.ids, held)), sensor_in_pose(rig, one.model)
         new = new.select(np.argsort(new.ids))
-        start = one.model.start(new.values, new.covariance)
+        parameters, spread = nuisance or (np.empty(0), np.empty((0, 0)))
+        self._models[one.kind] = one.model, parameters, spread
+        by = shifted(one.model, new.values)
+        noise = new.covariance + congruence(by, spread)
+        start = one.model.start(new.values - by @ parameters, noise)
         if start is None:
             return self._fixed(new, pose, xTs)
         points, known = start
@@ -135,7 +174,7 @@ class Waiting:
             self._singles.pop(identity, None)
         later = new.select(np.full(len(new), known is not None))
         if known is None:
-            known = congruence(np.linalg.inv(one.model.jacobian(points)), new.covariance)
+            known = congruence(np.linalg.inv(one.model.jacobian(points)), noise)
         turned = congruence(xTs[:3, :3], known)
         return Begun(new.ids, transform_to_world(xTs, points), turned, later)
 
@@ -165,54 +204,68 @@ class Waiting:
 
 
 _COLUMNS = ("wTs", "value", "noise")
+Known: TypeAlias = tuple[Any, FloatArray, FloatArray]
+"""A model, its nuisance parameters (3,) or (0,), and their covariance."""
 
 
 def fixed_point(
-    singles: list[Single], models: dict[str, Any]
+    singles: list[Single], models: dict[str, Known]
 ) -> tuple[FloatArray, FloatArray] | None:
     """The world point (3,) that fits, given the last pose, and its covariance (3, 3).
 
     None where it is open, or another one fits as well. Damped Gauss-Newton from starts in all
-    directions, on the models' own residuals; noise contains the drift since each.
+    directions, on the models' own residuals, together with how far nuisance parameters are off;
+    noise contains the drift since each.
     """
-    groups = []
+    groups, known = [], np.zeros((3, 3))
     for kind in {single.kind: None for single in singles}:
         own = [single for single in singles if single.kind == kind]
         drifts = np.array([nearest_positive(singles[-1].drift - one.drift) for one in own])
         columns = (np.array([getattr(one, name) for one in own]) for name in _COLUMNS)
-        groups.append((models[kind], len(own), *columns, drifts))
+        model, parameters, spread = models[kind]
+        at = slice(len(known), len(known) + len(spread))
+        groups.append((model, parameters, at, len(own), *columns, drifts))
+        known = block_diagonal(known, np.asarray(np.linalg.inv(spread))[None])
 
-    def linear(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        n = len(points)
-        hessian, gradient, cost = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-        for model, k, *columns in groups:
+    def linear(unknown: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        n, d = unknown.shape
+        hessian, gradient = np.tile(known, (n, 1, 1)), unknown @ known
+        cost = np.einsum("ni,ni->n", gradient, unknown)
+        for model, parameters, own, k, *columns in groups:
             wTs, values, noise, drift = (np.concatenate([c] * n) for c in columns)
-            rows = linearise(model, wTs, np.repeat(points, k, axis=0), values)
+            at = np.repeat(unknown, k, axis=0)
+            rows = linearise(model, wTs, at[:, :3], values)
             since = congruence(rows.by_pose @ adjoint(inverse(wTs)), drift)
-            weight, off = np.linalg.inv(noise + since), rows.residual
-            turned = np.swapaxes(rows.by_point, 1, 2) @ weight
-            hessian += (turned @ rows.by_point).reshape(n, k, 3, 3).sum(axis=1)
-            gradient += products(turned, off).reshape(n, k, 3).sum(axis=1)
+            by = np.zeros((*values.shape, d))
+            by[:, :, :3], by[:, :, own] = rows.by_point, shifted(model, values)
+            weight = np.linalg.inv(noise + since)
+            off = rows.residual + products(by[:, :, own], at[:, own] + parameters)
+            turned = np.swapaxes(by, 1, 2) @ weight
+            hessian += (turned @ by).reshape(n, k, d, d).sum(axis=1)
+            gradient += products(turned, off).reshape(n, k, d).sum(axis=1)
             squared = np.einsum("ki,kij,kj->k", off, weight, off)
             cost += np.where(rows.usable, squared, np.inf).reshape(n, k).sum(axis=1)
         return hessian, gradient, cost
 
     here = singles[-1].wTs[:3, 3]
-    starts = (np.array(_FROM_M)[:, None, None] * _directions()).reshape(-1, 3) + here
+    starts = np.zeros((len(_FROM_M) * _FROM, len(known)))
+    starts[:, :3] = (np.array(_FROM_M)[:, None, None] * _directions()).reshape(-1, 3) + here
     with np.errstate(all="ignore"):
-        points = _FIT.minimise(starts, lambda at, _: linear(at)[:2])
-        hessian, _, cost = linear(points)
+        found = _FIT.minimise(starts, lambda at, _: linear(at)[:2])
+        hessian, _, cost = linear(found)
     cost[~np.isfinite(cost)] = np.inf
-    best = int(np.argmin(cost))
+    best, points = int(np.argmin(cost)), found[:, :3]
     if not np.isfinite(cost[best]):
         return None
-    information = np.linalg.eigvalsh(hessian[best])[0]
+    whole = hessian[best]
+    own = whole[:3, :3] - whole[:3, 3:] @ np.linalg.solve(whole[3:, 3:], whole[3:, :3])
+    information = np.linalg.eigvalsh(own)[0]
     distance = float(np.linalg.norm(points[best] - here))
     if information * distance**2 < _KNOWN**2:
         return None
     apart = np.linalg.norm(points - points[best], axis=1) ** 2
     rivals = (cost < cost[best] + _RIVAL) & (apart * information > _RIVAL)
-    return None if rivals.any() else (points[best], np.linalg.inv(hessian[best]))
+    return None if rivals.any() else (points[best], np.linalg.inv(own))
 
 
 def _directions() -> FloatArray:

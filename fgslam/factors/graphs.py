@@ -8,13 +8,14 @@ back) gets a new variable.
 from __future__ import annotations
 
 from typing import Any
+from zlib import crc32
 
 import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 
-_POSE, _LANDMARK = "x", "l"
+_POSE, _LANDMARK, _NUISANCE = "x", "l", "n"
 _TARGET, _VELOCITY = "t", "v"
 _CHARACTER_AT = 56  # bits of a key below its character
 _FIRST_LANDMARK = int(gtsam.symbol(_LANDMARK, 0))
@@ -30,9 +31,19 @@ def landmark_key(variable: int) -> int:
     return _FIRST_LANDMARK + variable
 
 
+def nuisance_key(kind: str) -> int:
+    """Key of the nuisance parameters (3,) of a kind of measurement."""
+    return int(gtsam.symbol(_NUISANCE, crc32(kind.encode())))
+
+
 def is_pose(key: int) -> bool:
     """Whether a key is a pose's."""
     return key >> _CHARACTER_AT == ord(_POSE)
+
+
+def is_landmark(key: int) -> bool:
+    """Whether a key is a landmark's."""
+    return key >> _CHARACTER_AT == ord(_LANDMARK)
 
 
 def number(key: int) -> int:
@@ -61,7 +72,8 @@ def landmarks_in(values: Any) -> tuple[IntArray, FloatArray]:
     """
     keys = np.array(values.keys(), np.int64)
     variables = keys[keys >> _CHARACTER_AT == ord(_LANDMARK)] - _FIRST_LANDMARK
-    return variables, np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3)
+    points = np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3)
+    return variables, points[: len(variables)]  # nuisance parameters come after them
 
 
 def poses_of_frame(values: Any, frame: int) -> FloatArray:

@@ -18,6 +18,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, Rows
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.geometry import adjoint, inverse, se3_exp, skew, transform_to_camera, wrap
 from fgslam.core.sensors import CameraRig, Measured
+from fgslam.factors.graphs import nuisance_key
 
 _STEP = 6e-6  # of a central difference: the third root of the rounding, where both errors are least
 
@@ -36,6 +37,7 @@ class MeasurementModel:
     size: ClassVar[int]
     angles: ClassVar[tuple[int, ...]] = ()
     unpredicted: ClassVar[float] = 0.0  # residual of what cannot be predicted
+    nuisance: FloatArray = np.empty((0, 0))
 
     def __init__(self, bTs: FloatArray | None = None) -> None:
         """``bTs`` left out: the sensor's frame is the body's."""
@@ -43,8 +45,8 @@ class MeasurementModel:
 
     @property
     def has_factor(self) -> bool:
-        """Whether :meth:`factor` gives one."""
-        return type(self).factor is not MeasurementModel.factor
+        """Whether :meth:`factor` gives one, which knows no nuisance parameters."""
+        return type(self).factor is not MeasurementModel.factor and not self.nuisance.size
 
     def measured(
         self, values: npt.ArrayLike, covariance: npt.ArrayLike, ids: npt.ArrayLike = ()
@@ -62,7 +64,11 @@ class MeasurementModel:
         """
         given, m = np.atleast_2d(np.asarray(values, np.float64)), self.size
         k, noise = len(given), np.asarray(covariance, np.float64)
-        wanted = 0 if isinstance(self, PoseModel) else k
+        wanted, most = (0, 0) if isinstance(self, PoseModel) else (k, 3)
+        if len(self.nuisance) > most:
+            raise MeasurementLogError(
+                f"{self.kind}: {len(self.nuisance)} nuisance parameters; give at most {most}"
+            )
         if len(np.unique(ids)) != wanted or np.size(ids) != wanted:
             raise MeasurementLogError(f"{self.kind}: give {wanted} different ids for {k} values")
         if given.shape != (k, m) or noise.shape not in ((m, m), (k, m, m)):
@@ -116,7 +122,16 @@ class MeasurementModel:
 
 
 class LandmarkModel(MeasurementModel):
-    """What is measured of landmarks: ``predict`` is given points (k, 3) in the sensor's frame."""
+    """What is measured of landmarks: ``predict`` is given points (k, 3) in the sensor's frame.
+
+    Attributes:
+        nuisance: (q, q) covariance, about zero, of constants of the sensor that shift what it
+            measures, at most 3: they are estimated along. (0, 0): none.
+    """
+
+    def shifts(self, z: FloatArray) -> FloatArray:
+        """(k, m, q) by which a unit of each nuisance parameter shifts measurements (k, m)."""
+        return np.zeros((*z.shape, len(self.nuisance)))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """(k, m, 3) derivatives by the points; by central differences, right to 1e-10."""
@@ -231,6 +246,20 @@ def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kji,kj->ki", poses[:, :3, :3], offset))
 
 
+def shifted(model: Any, z: FloatArray) -> FloatArray:
+    """(k, m, 3) shifts by up to 3 nuisance parameters; (k, m, 0) of a model without any."""
+    more = (3 - len(model.nuisance)) % 3
+    return np.asarray(np.pad(model.shifts(z), ((0, 0), (0, 0), (0, more))))
+
+
+def nuisance_covariance(model: Any) -> FloatArray:
+    """(3, 3) of the same parameters beforehand; else (0, 0)."""
+    q = len(model.nuisance)
+    out = np.eye(3 if q else 0)
+    out[:q, :q] = model.nuisance
+    return out
+
+
 def whitening(covariances: FloatArray) -> FloatArray:
     """(k, m, m) that turn residuals of covariances (k, m, m) into ones of unit covariance."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
@@ -241,14 +270,20 @@ def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 
+def nuisance_prior(model: MeasurementModel) -> Any:
+    """GTSAM's factor of what is known beforehand of the nuisance parameters of a kind."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(nuisance_covariance(model))
+    return gtsam.PriorFactorVector(nuisance_key(model.kind), np.zeros(3), noise)
+
+
 def gtsam_factor(
     model: MeasurementModel, keys: list[int], z: FloatArray, noise: Any, xTs: FloatArray
 ) -> Any:
     """The model's C++ factor; where it has none, one that calls back, 30 to 400 us each.
 
-    Arguments are those of :meth:`MeasurementModel.factor`.
+    Arguments are those of :meth:`MeasurementModel.factor`; a third key is of nuisance parameters.
     """
-    given = model.factor(keys, z, noise, xTs)
+    given = None if model.nuisance.size else model.factor(keys, z, noise, xTs)
     if given is not None:
         return given
 
@@ -256,9 +291,13 @@ def gtsam_factor(
         poses = values.atPose3(keys[0]).matrix()[None]
         points = values.atPoint3(keys[1])[None] if keys[1:] else None
         rows = linearise(model, poses, points, z[None], xTs=xTs)
+        derivatives, off = [rows.by_pose[0], rows.by_point[0]], rows.residual[0]
+        for key in keys[2:]:
+            derivatives.append(shifted(model, z[None])[0])
+            off = off + derivatives[-1] @ values.atVector(key)
         if jacobians is not None:
-            for place, by in zip(range(len(keys)), (rows.by_pose, rows.by_point), strict=False):
-                jacobians[place] = by[0]
-        return np.asarray(rows.residual[0])
+            for place in range(len(keys)):
+                jacobians[place] = derivatives[place]
+        return np.asarray(off)
 
     return gtsam.CustomFactor(noise, keys, error)

@@ -38,6 +38,16 @@ class Range(LandmarkModel):
 
     kind, size = "range", 1
 
+    def __init__(self, bTs: FloatArray | None = None, offset_sigma_m: float = 0.0) -> None:
+        """Of a sensor on the body; with an offset of all ranges of about so many metres."""
+        super().__init__(bTs)
+        if offset_sigma_m:
+            self.nuisance = np.array([[offset_sigma_m**2]])
+
+    def shifts(self, z: FloatArray) -> FloatArray:
+        """(k, 1, 1) one for the offset."""
+        return np.ones((*z.shape, len(self.nuisance)))
+
     def predict(self, x: FloatArray) -> FloatArray:
         """(k, 1); at the sensor itself a distance has no direction."""
         distance = np.linalg.norm(x, axis=1, keepdims=True)

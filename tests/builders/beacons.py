@@ -43,9 +43,21 @@ class GuessedDirection(Direction):
         return 4.0 * rays, np.tile(16.0 * np.eye(3), (len(z), 1, 1))
 
 
+class OffsetRange(Range):
+    """Ranges that are all too long by an unknown offset."""
+
+    kind = "offset_range"
+
+    def __init__(self, bTs: FloatArray | None = None) -> None:
+        """By a metre or so."""
+        super().__init__(bTs, offset_sigma_m=1.0)
+
+
+OFFSET_M = 0.7
 SIGMA = {
     "range_bearing": (0.05, 0.02, 0.02),
     "range": (0.05,),
+    "offset_range": (0.05,),
     "height": (0.05,),
     "position": (0.05, 0.05, 0.05),
     "direction": (0.02, 0.02),
@@ -54,7 +66,7 @@ SIGMA = {
 """Deviations of the measurements, metres and radians."""
 MODELS: dict[str, MeasurementModel] = {
     one.kind: one(SENSOR)
-    for one in (RangeBearing, Range, Height, Position, Direction, GuessedDirection)
+    for one in (RangeBearing, Range, OffsetRange, Height, Position, Direction, GuessedDirection)
 }
 
 
@@ -100,6 +112,7 @@ def drive(kinds: Sequence[str], seed: int = 0, frames: int = 30, beacons: int = 
             of_pose = isinstance(model, PoseModel)
             exact = model.predict(wTs[None] if of_pose else (points - wTs[:3, 3]) @ wTs[:3, :3])
             values = exact + sigma * rng.standard_normal(exact.shape)
+            values += OFFSET_M * (kind == "offset_range")
             ids = () if of_pose else np.arange(beacons)
             measured.append(model.measured(values, np.diag(sigma**2), ids))
         log.append(Increment.of(k, 0.1 * k, odometry, measured))

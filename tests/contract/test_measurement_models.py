@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
-from beacons import MODELS, SENSOR, Beacons, Direction, drive
+from beacons import MODELS, OFFSET_M, SENSOR, Beacons, Direction, drive
 from test_estimators import SETTINGS
 
 import fgslam as fg
@@ -23,7 +24,7 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig, Increment, Odometry
 from fgslam.core.store import restore, state_of
 from fgslam.core.types import Prediction
-from fgslam.factors.graphs import landmark_key, pose_key, solver_parameters
+from fgslam.factors.graphs import landmark_key, nuisance_key, pose_key, solver_parameters
 from fgslam.factors.measurement import MeasurementModel, PoseModel, gtsam_factor, linearise
 from fgslam.factors.models import Position, Range
 from fgslam.slam.build import make_estimator
@@ -123,7 +124,8 @@ def smoothed(world: Beacons, kind: str = "batch") -> Smoother:
 
 
 @pytest.mark.parametrize(
-    "kinds", [("range_bearing",), ("guessed_direction", "position"), ("range",)]
+    "kinds",
+    [("range_bearing",), ("guessed_direction", "position"), ("range",), ("range", "offset_range")],
 )
 def test_batch_ends_at_the_optimum_of_gtsam(kinds: tuple[str, ...]) -> None:
     estimator = smoothed(drive(kinds, frames=24, beacons=4))
@@ -148,8 +150,35 @@ def test_isam2_takes_linear_factors_for_those_that_call_back(
     np.testing.assert_allclose(*online, rtol=0, atol=2e-3)
 
 
+def test_an_offset_is_found_and_stated_with_its_deviation() -> None:
+    """A window and the filter of single landmarks take it for noise of each measurement."""
+    world = drive(("position", "offset_range"), frames=60)
+    by_odometry = world.ate(fg.replay(world.log, "odometry").estimate)
+    for kind in ESTIMATORS:
+        found = fg.replay(world.log, kind)
+        assert not found.failure
+        assert world.ate(found.estimate) < 0.6 * by_odometry
+        if kind != "fixed_lag":
+            (words,) = (one for one in found.estimate.remarks if "nuisance" in one)
+            value, deviation = map(float, re.findall(r"\d\.\d+", words))
+            assert abs(value - OFFSET_M) < 3.0 * deviation
+            assert deviation < (0.5 if kind == "landmark_kalman" else 0.05)
+    offset = fg.graph(world.log).values.atVector(nuisance_key("offset_range"))
+    np.testing.assert_allclose(offset, [value, 0.0, 0.0], rtol=0.0, atol=1e-4)
+
+
+class ShiftedPoint(RelativePoint):
+    """All points are off alike, by two numbers."""
+
+    kind, nuisance = "shifted_point", np.diag([0.3, 0.1])
+
+    def shifts(self, z: FloatArray) -> FloatArray:
+        """Ahead, and to the left."""
+        return np.tile(np.eye(3)[:, :2], (len(z), 1, 1))
+
+
 def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:
-    """Without turns, of points and positions in the axes of the world."""
+    """Without turns, of positions and of points that are shifted, in the axes of the world."""
     points, stiff = rng.normal(size=(4, 3)), 1.1e-6
     known, noise = np.diag([stiff**2] * 3 + [0.05**2] * 3), 0.04 * np.eye(3)
     log = MeasurementLog()
@@ -158,7 +187,7 @@ def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:
         step = pose(np.eye(3), np.array([0.3, 0.1, 0.0]) + 0.002 * rng.normal(size=3))
         seen = points - here + 0.01 * rng.normal(size=(4, 3))
         measured = [
-            RelativePoint().measured(seen, noise, range(4)),
+            (ShiftedPoint() if k else RelativePoint()).measured(seen, noise, range(4)),
             Position().measured(here + 0.01 * rng.normal(size=3), noise),
         ]
         odometry = Odometry(step, known) if k else None
@@ -190,9 +219,12 @@ def test_covariances_state_the_errors(estimator: str, seeds: int, low: float, hi
     assert low < np.mean(nees) < high
 
 
+@pytest.mark.parametrize("measured", ["direction", "offset_range"])
 @pytest.mark.parametrize("kind", ["ekf", "landmark_kalman"])
-def test_resumed_with_landmarks_that_wait_continues_to_the_same_bits(kind: str) -> None:
-    world = drive(("direction",), frames=12, beacons=3)
+def test_resumed_with_landmarks_that_wait_continues_to_the_same_bits(
+    kind: str, measured: str
+) -> None:
+    world = drive((measured,), frames=20, beacons=3)
     first, second = (make_estimator(world.log.rig, SETTINGS[kind]) for _ in range(2))
     fg.replay(MeasurementLog(increments=world.log.increments[:3]), first)
     restore(second, state_of(first))
@@ -233,6 +265,13 @@ def test_measurements_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(MeasurementLogError, match=words):
         Direction().measured(values, covariance, ids)
+
+
+def test_nuisance_parameters_are_few_and_of_landmarks() -> None:
+    offset = Position()
+    offset.nuisance = np.eye(1)
+    with pytest.raises(MeasurementLogError, match="1 nuisance parameters; give at most 0"):
+        offset.measured([[0.0, 0.0, 0.0]], np.eye(3))
 
 
 def test_graph_of_a_log_is_at_the_optimum_and_takes_factors() -> None:

@@ -24,7 +24,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
-from fgslam.backend.measured import Waiting, linearised, require_model
+from fgslam.backend.measured import Waiting, linearised, nuisance_words, require_model
 from fgslam.backend.settings import JointFilterSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.errors import EstimatorError
@@ -51,7 +51,13 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, Estimate, Floor, LandmarkMap, Prediction, UpdateStats
-from fgslam.factors.measurement import LinearRows, linearise, products, whitening
+from fgslam.factors.measurement import (
+    LinearRows,
+    linearise,
+    nuisance_covariance,
+    products,
+    whitening,
+)
 
 FRONT = 6
 """The pose's rows and columns come first."""
@@ -114,10 +120,11 @@ def _with_landmarks(
 ) -> tuple[FloatArray, FloatArray]:
     """``P H^T`` (n, km) and ``H P H^T + R`` (km, km) of the matches."""
     n, (k, m) = len(front), matches.innovation.shape
-    rows = rows_of(matches.blocks)
+    width = matches.by_landmark.shape[2]
+    rows = rows_of(matches.blocks.ravel()).reshape(k, width)
     columns = covariance.columns(rows.ravel())
     columns[:FRONT] = front[rows.ravel()].T
-    by_block = columns.reshape(n, k, 3).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
+    by_block = columns.reshape(n, k, width).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
     by_pose = matches.by_pose.reshape(-1, FRONT)
     cross = by_block.swapaxes(0, 1).reshape(n, m * k) + front @ by_pose.T
     s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(m * k, m * k)
@@ -226,6 +233,7 @@ class FullEkf:
     _remarks: Kept[list[str]]
     _considered: Kept[ConsiderCovariance]
     _waiting: Kept[Waiting]
+    _nuisances: Kept[list[str]]
 
     def __init__(
         self, sensor: CameraRig, settings: JointFilterSettings, floor: Floor, prior: Prediction
@@ -241,6 +249,7 @@ class FullEkf:
         self._past = FilteredTrajectory()
         self._considered = ConsiderCovariance(sensor, floor)
         self._waiting = Waiting()
+        self._nuisances = []  # kinds: their parameters are blocks of the identities -1, -2, ...
         self._matched = self._gated = self._skipped = 0
         self._remarks = []
         self._map: LandmarkMap | None = None
@@ -297,7 +306,7 @@ class FullEkf:
         current = self._considered.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
         self._past.append(increment.timestamp, current)
         return UpdateStats(
-            current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof, closed
+            current.wTc, current.covariance, len(self.landmarks()), found.nis, found.nis_dof, closed
         )
 
     # -- what may fail, before anything is changed ---------------------------------------------
@@ -372,19 +381,36 @@ class FullEkf:
         else:
             one = one.select(np.isin(one.ids, self._ids))
             blocks = self._blocks(one.ids)
-            rows = linearised(self._sensor, one, self._wTc, self._positions[blocks])
-            matches = Matches.usable(rows, blocks, one.covariance)
+            own = self._nuisance(one)
+            parameters = self._positions[own[0]] if len(own) else None
+            rows = linearised(self._sensor, one, self._wTc, self._positions[blocks], parameters)
+            every = np.column_stack([blocks, np.broadcast_to(own, (len(one), len(own)))])
+            matches = Matches.usable(rows, every, one.covariance)
         front = self._covariance.front()
         found = self._corrected(index, front, matches, of_pose)
         self._apply(found.of_the_pose_alone() if self._fixed else found, self._wTc, front)
         self._matched += found.matched
         self._gated += found.matched - found.nis_dof // one.values.shape[1]
 
+    def _nuisance(self, one: Measured) -> IntArray:
+        """(1,) block of the sensor's nuisance parameters, (0,) of a sensor without."""
+        if not one.model.nuisance.size:
+            return np.empty(0, np.int64)
+        if one.kind not in self._nuisances:
+            self._nuisances.append(one.kind)
+            self._covariance.append_independent(nuisance_covariance(one.model)[None])
+            self._ids = np.append(self._ids, -len(self._nuisances))
+            self._positions = np.concatenate([self._positions, np.zeros((1, 3))])
+        return np.flatnonzero(self._ids == -1 - self._nuisances.index(one.kind))
+
     def _begin(self, one: Measured, index: int) -> None:
         """Landmarks that another sensor's measurements give a place now."""
         if not one.of_pose:
             pose = Prediction(self._wTc, self._covariance.front()[:FRONT])
-            begun = self._waiting.begin(self._sensor, one, pose, self._ids)
+            own = self._nuisance(one)
+            spread = self._covariance.diagonal_blocks(own)
+            parameters = (self._positions[own[0]], spread[0]) if len(own) else None
+            begun = self._waiting.begin(self._sensor, one, pose, self._ids, parameters)
             self._require_space(f"frame {index}", len(self._ids) + len(begun.ids))
             self._add(begun.ids, begun.points, begun.covariances)
             self._correct_by(begun.later, index)
@@ -491,7 +517,7 @@ class FullEkf:
     def landmarks(self) -> LandmarkMap:
         """Landmarks with their marginal covariances."""
         if self._map is None:
-            order = np.argsort(self._ids, kind="stable")
+            order = np.argsort(self._ids, kind="stable")[len(self._nuisances) :]
             covariances = self._covariance.diagonal_blocks(order)
             self._map = LandmarkMap(self._ids[order], self._positions[order], covariances)
         return self._map
@@ -499,6 +525,10 @@ class FullEkf:
     def estimate(self) -> Estimate:
         """Trajectory as filtered, and the map."""
         remarks = [_NO_MOTIONS]
+        for number, kind in enumerate(self._nuisances, 1):
+            (block,) = at = np.flatnonzero(self._ids == -number)
+            spread = np.diagonal(self._covariance.diagonal_blocks(at)[0])
+            remarks.append(nuisance_words(kind, self._positions[block], spread))
         if self._gated:
             remarks.append(
                 f"{self._gated} of {self._matched} matches left out: innovation beyond "
@@ -545,10 +575,10 @@ class Matches(Rows):
     """Observations of known landmarks, linearised at a pose.
 
     Attributes:
-        blocks: (k,) landmark blocks of the covariance.
+        blocks: (k, b) landmark blocks of the covariance, or (k,); of nuisance parameters, too.
         innovation: (k, m) measured less expected.
         by_pose: (k, m, 6) d(measurement)/d(tangent of the pose).
-        by_landmark: (k, m, 3) d(measurement)/d(position in the world).
+        by_landmark: (k, m, 3b) d(measurement)/d(position in the world), parameters behind.
         noise: (k, m, m) covariance of the measurement.
     """
 

@@ -37,7 +37,7 @@ from fgslam.backend.loops import (
     starts_new_part,
     transported,
 )
-from fgslam.backend.measured import Waiting, linearised, require_model
+from fgslam.backend.measured import Waiting, linearised, nuisance_words, require_model
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import PerLandmarkSettings
@@ -62,6 +62,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.store import Kept
 from fgslam.core.types import LAGS, EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.factors.measurement import nuisance_covariance
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
@@ -80,6 +81,7 @@ class LandmarkKalman:
     _errors: Kept[SampledErrors]
     _applied: Kept[FloatArray]
     _waiting: Kept[Waiting]
+    _nuisances: Kept[list[str]]
 
     def __init__(
         self,
@@ -108,6 +110,7 @@ class LandmarkKalman:
         solver = EgoMotionSolver(rig, ego_motion or EgoMotionSettings())
         self._errors = SampledErrors(solver, off=ego_motion is None)
         self._floor, self._waiting = solver.floor, Waiting()
+        self._nuisances = []  # kinds: their parameters are rows of the identities -1, -2, ...
         self._fixed = False
         self._applied = np.empty(0)  # correction of the rig in the last frame
 
@@ -153,7 +156,7 @@ class LandmarkKalman:
         self._past.covariances[-1] = current.covariance
         self._motions.append(self._errors.motions(current.wTc))
         return UpdateStats(
-            current.wTc, current.covariance, len(self._rows), nis, 3 * len(used), closed
+            current.wTc, current.covariance, len(self.landmarks()), nis, 3 * len(used), closed
         )
 
     def _step(self, increment: Increment, tracking: EgoMotion) -> TrackedStep:
@@ -196,13 +199,21 @@ class LandmarkKalman:
 
     def _measure(self, one: Measured) -> None:
         """The pose, then known landmarks, by what another sensor measured of them."""
-        held, before = self._rows, self._current
+        own, held, before = self._nuisance(one), self._rows, self._current
         one = one if one.of_pose else one.select(np.isin(one.ids, held.ids))
+        if len(own) and len(one) > 1:  # each knows what the one before made of the parameters
+            for row in range(len(one)):
+                self._measure(one.select(np.array([row])))
+            return
         if not len(one):
             return
-        at = held.rows(one.ids)
+        ids = np.concatenate([one.ids, own])
+        at = held.rows(ids)
         known = Landmarks(held.positions[at], held.covariances[at])
-        rows = linearised(self._rig, one, before.wTc, None if one.of_pose else known.positions)
+        known = _joined(known) if len(own) else known
+        points = None if one.of_pose else known.positions[:, :3]
+        parameters = known.positions[0, 3:] if len(own) else None
+        rows = linearised(self._rig, one, before.wTc, points, parameters)
         noise = one.covariance
         if not one.of_pose:
             noise = noise + congruence(rows.by_point, known.covariances)
@@ -213,22 +224,46 @@ class LandmarkKalman:
         wTc = self._floor.constrain(moved_apart(before.wTc, -gain @ rows.residual.ravel()))
         kept = congruence(np.eye(6) - gain @ by_pose, before.covariance)
         self._current = Prediction(wTc, kept + congruence(gain, noise))
-        drawn = self._errors.correct(gain, rows, one.ids, one.covariance)
+        drawn = self._errors.correct(gain, rows, ids, one.covariance)
         if not one.of_pose and not self._fixed:
-            rows = linearised(self._rig, one, wTc, known.positions)
+            rows = linearised(self._rig, one, wTc, points, parameters)
             noise = one.covariance + congruence(rows.by_pose, self._current.covariance)
             found = kalman_update(known, rows.by_point, -rows.residual, noise)
-            held.positions[at], held.covariances[at] = found.positions, found.covariances
+            held.positions[at] = found.positions.reshape(-1, 3)
+            spread = found.covariances
+            held.covariances[at] = np.concatenate(
+                [spread[:, k : k + 3, k : k + 3] for k in range(0, spread.shape[1], 3)]
+            )
             held.lasts[at] = len(self._past)
             held.counts[at] += 1
-            self._errors.pull(np.asarray(found.gain), rows, one.ids, drawn)
+            self._errors.pull(np.asarray(found.gain), rows, ids, drawn)
+
+    def _nuisance(self, one: Measured) -> IntArray:
+        """(1,) identity of the sensor's nuisance parameters, (0,) of a sensor without."""
+        if not one.model.nuisance.size:
+            return np.empty(0, np.int64)
+        if one.kind not in self._nuisances:
+            self._nuisances.append(one.kind)
+            new, spread = np.array([-len(self._nuisances)]), nuisance_covariance(one.model)[None]
+            self._rows.add(new, np.zeros((1, 3)), spread, -1)
+            self._errors.begin(new, np.zeros((1, 3, 6)), spread)
+        return np.array([-1 - self._nuisances.index(one.kind)])
+
+    def nuisance(self, kind: str) -> tuple[FloatArray, FloatArray] | None:
+        """Parameters (3,) of a kind of measurement and their covariance; None without any."""
+        if kind not in self._nuisances:
+            return None
+        at = self._rows.rows(np.array([-1 - self._nuisances.index(kind)]))[0]
+        return self._rows.positions[at], self._rows.covariances[at]
 
     def _begin(self, one: Measured) -> None:
         """Landmarks that another sensor's measurements give a place now."""
         if one.of_pose:
             return
-        pose = self._current
-        begun = self._waiting.begin(self._rig, one, pose, self._rows.ids)
+        pose, held = self._current, self._rows
+        self._nuisance(one)
+        known = self.nuisance(one.kind)
+        begun = self._waiting.begin(self._rig, one, pose, held.ids, known)
         turned = congruence(pose.wTc[:3, :3], begun.covariances)
         by_pose = -pose.wTc[:3, :3] @ point_pose_jacobian(begun.points)
         own = turned + congruence(by_pose, pose.covariance)
@@ -266,18 +301,23 @@ class LandmarkKalman:
 
     def landmarks(self) -> LandmarkMap:
         """Current landmarks, until the next update; the arrays are read only by agreement."""
-        return self._rows.map()
+        return self._rows.map(len(self._nuisances))
 
     def estimate(self) -> Estimate:
         """Trajectory as filtered, corrected by loops, and the map."""
-        rows = self._rows
+        rows = self.landmarks()
         held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
+        remarks, whole = list(self._drive.remarks), self._errors.landmarks(self._rows.map())
+        for number, kind in enumerate(self._nuisances, 1):
+            at = whole.rows(np.array([-number]))[0]
+            spread = np.diagonal(whole.covariances[at])
+            remarks.append(nuisance_words(kind, whole.positions[at], spread))
         relative = motions_by_lag(self._motions)
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
             self._errors.landmarks(held),
-            tuple(self._drive.remarks),
+            tuple(remarks),
             noise_factor=1.0,
             relative=relative,
             online_relative=relative,
@@ -301,7 +341,7 @@ class LandmarkKalman:
     @property
     def homes(self) -> IntArray:
         """(n,) frame with which each landmark of the map moves; -1 for one that stays."""
-        return self._rows.homes
+        return self._rows.homes[len(self._nuisances) :]
 
     @property
     def chain(self) -> Chain:
@@ -349,6 +389,12 @@ class LandmarkKalman:
         poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
         self._rows.positions[known] = change.moved(poses, self._rows.positions[known])
         return change
+
+
+def _joined(both: Landmarks) -> Landmarks:
+    """A landmark and nuisance parameters, two rows, as one of six numbers."""
+    covariance = block_diagonal(np.empty((0, 0)), both.covariances)
+    return Landmarks(both.positions.reshape(1, 6), covariance[None])
 
 
 def motions_by_lag(motions: list[FloatArray]) -> dict[int, FloatArray]:
@@ -405,9 +451,9 @@ class LandmarkRows(GrowingColumns):
             lasts=number,
         )
 
-    def map(self) -> LandmarkMap:
-        """As a map; only until the next landmark comes or goes."""
-        return LandmarkMap(self.ids, self.positions, self.covariances)
+    def map(self, first: int = 0) -> LandmarkMap:
+        """As a map from a row on; only until the next landmark comes or goes."""
+        return LandmarkMap(self.ids[first:], self.positions[first:], self.covariances[first:])
 
     def rows(self, ids: IntArray) -> IntArray:
         """Row of each id. Raises KeyError when one is absent."""

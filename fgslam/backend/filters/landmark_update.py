@@ -48,7 +48,7 @@ def kalman_update(
     before, inverse = known.covariances, inverse_spd3 if noise.shape[1] == 3 else np.linalg.inv
     precision = inverse(congruence(jacobian, before) + noise)
     gain = before @ np.swapaxes(jacobian, 1, 2) @ precision
-    keep = np.eye(3) - gain @ jacobian
+    keep = np.eye(before.shape[1]) - gain @ jacobian
     return Landmarks(
         known.positions + np.einsum("kij,kj->ki", gain, innovation),
         congruence(keep, before) + congruence(gain, noise),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from typing import Any
@@ -30,14 +30,16 @@ from fgslam.backend.smoothers.elimination import (
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import Damping, adjoint, compose_covariance, inverse
+from fgslam.core.geometry import Damping, adjoint, compose_covariance, congruence, inverse
 from fgslam.core.sensors import BiasEffect, Odometry
-from fgslam.factors.graphs import is_pose, number
+from fgslam.factors.graphs import is_landmark, is_pose, landmarks_in, nuisance_key, number
 from fgslam.factors.measurement import (
     LinearRows,
     gtsam_factor,
     linearise,
+    nuisance_covariance,
     residuals,
+    shifted,
     whitening,
 )
 from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definite
@@ -78,11 +80,12 @@ class Sightings(Rows):
         """A graph of GTSAM's, by keys."""
         out = gtsam.NonlinearFactorGraph()
         xTs = np.eye(4) if self.xTs is None else self.xTs
+        more = [nuisance_key(self.model.kind)] if self.model.nuisance.size else []
         for pose, point, z, root in zip(
             self.poses.tolist(), self.points.tolist(), self.measured, self.roots, strict=True
         ):
             noise = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-            out.add(gtsam_factor(self.model, [pose, point], z, noise, xTs))
+            out.add(gtsam_factor(self.model, [pose, point, *more], z, noise, xTs))
         return out
 
     def of_points(self, kept: BoolArray) -> Sightings:
@@ -99,6 +102,17 @@ class Sightings(Rows):
         """The same, with derivatives."""
         own, seen = poses[self.poses], points[self.points]
         return linearise(self.model, own, seen, self.measured, self.roots, self.xTs)
+
+    def shifted(self) -> FloatArray:
+        """(k, m, 3) whitened, by the sensor's nuisance parameters; (k, m, 0) without any."""
+        return self.roots @ shifted(self.model, self.measured)
+
+    def considering(self, nuisance: FloatArray, covariance: FloatArray) -> Sightings:
+        """With nuisance parameters (3,) as known, and their covariance (3, 3) as noise of each."""
+        by, root = shifted(self.model, self.measured), np.linalg.inv(self.roots)
+        noise = root @ np.swapaxes(root, 1, 2) + congruence(by, covariance)
+        measured = self.measured - by @ nuisance
+        return dataclasses.replace(self, measured=measured, roots=whitening(noise))
 
     def incidence(self, n: int, m: int) -> tuple[csr_matrix, csr_matrix]:
         """(n, k) and (m, k): which observation is which pose's and which landmark's."""
@@ -311,7 +325,7 @@ class Turns:
         by_pose = bsr_matrix((blocks, columns, 2 * np.arange(k + 1)), (6 * k, 6 * n)).tocsr()
         residual, by_bias = self.residuals(poses, bias).ravel(), self._by_bias()
         border = Border(
-            by_pose.T @ by_bias,
+            np.concatenate([np.zeros((system.columns, len(bias))), by_pose.T @ by_bias]),
             by_bias.T @ by_bias + self.known,
             by_bias.T @ residual + self.known @ bias,
         )
@@ -419,16 +433,37 @@ class OtherFactors:
     def cost(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> float:
         """Half the sum of squares at poses (n, 4, 4), points (m, 3) and biases (3q,)."""
         cost = float(self.graph.error(values_of(self._rows, poses, points)))
-        cost += 0.5 * sum(float((s.residuals(poses, points) ** 2).sum()) for s in self.measured)
-        return cost if self.turns is None else cost + self.turns.cost(poses, bias)
+        turns = 0 if self.turns is None else len(self.turns.known)
+        for one, known, values in self.nuisances(bias):
+            off = one.residuals(poses, points) + one.shifted() @ values
+            cost += 0.5 * float((off**2).sum() + values @ known @ values)
+        return cost if self.turns is None else cost + self.turns.cost(poses, bias[:turns])
+
+    def nuisances(self, bias: FloatArray) -> Iterator[tuple[Sightings, FloatArray, FloatArray]]:
+        """Each sensor's measurements, information of its nuisance parameters, and their values."""
+        at = 0 if self.turns is None else len(self.turns.known)
+        for one in self.measured:
+            known = np.asarray(np.linalg.inv(nuisance_covariance(one.model)), np.float64)
+            yield one, known, bias[at : at + len(known)]
+            at += len(known)
 
     def linear(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> LinearSystem:
         """Their normal equations there."""
-        system = self._linear(poses, points)
-        for one in self.measured:
+        system, borders = self._linear(poses, points), list[Border]()
+        for one, known, values in self.nuisances(bias):
             rows, incidence = one.look(poses, points), one.incidence(len(poses), len(points))
-            system = one.joined(system, rows, np.ones(len(one)), incidence)
-        return system if self.turns is None else self.turns.joined(system, poses, bias)
+            weights, by = np.ones(len(one)), one.shifted()
+            rows = dataclasses.replace(rows, residual=rows.residual + by @ values)
+            system = one.joined(system, rows, weights, incidence)
+            if len(known):
+                pull = _pulled(rows, by, weights, incidence)
+                gradient = np.einsum("kip,ki->p", by, rows.residual) + known @ values
+                borders.append(Border(pull[:-3], pull[-3:] + known, gradient))
+        if self.turns is not None:
+            system = self.turns.joined(system, poses, bias[: len(self.turns.known)])
+        for border in borders:
+            system = dataclasses.replace(system, border=border.plus(system.border))
+        return system
 
     @cached_property
     def _rows(self) -> dict[int, int]:
@@ -501,7 +536,7 @@ class State:
         flat = gtsam.utilities.extractPose3(values)
         poses = np.tile(np.eye(4), (len(flat), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
-        return State(poses, np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3))
+        return State(poses, landmarks_in(values)[1])
 
     def moved(self, step: FloatArray) -> State:
         """After a step (3m + 6n + 3q,) of landmarks, in the poses' tangent spaces, of biases."""
@@ -605,7 +640,11 @@ class WholeGraph:
     def values(self, state: State) -> Any:
         """GTSAM values of all variables."""
         keys = [*enumerate(self.pose_keys), *enumerate(self.landmark_keys)]
-        return values_of({key: row for row, key in keys}, state.poses, state.points)
+        values = values_of({key: row for row, key in keys}, state.poses, state.points)
+        for one, known, found in self.rest.nuisances(state.bias):
+            if len(known):
+                values.insert(nuisance_key(one.model.kind), found)
+        return values
 
     def squared(self, state: State) -> FloatArray:
         """(k,) squared whitened residuals of the observations, without weights and kernel."""
@@ -642,12 +681,8 @@ class WholeGraph:
         rows, parts = seen.look(state.poses, state.points), []
         for few in np.array_split(np.arange(len(seen)), len(seen) // _AT_ONCE + 1):
             by = -seen.roots[few] @ shifts(seen.measured[few])
-            known = self.weights[few, None, None] * by
-            poses, points = (which[:, few] for which in self._incidence)
-            of_points = _summed(points, np.swapaxes(rows.by_point[few], 1, 2) @ known)
-            of_poses = _summed(poses, np.swapaxes(rows.by_pose[few], 1, 2) @ known)
-            own = np.einsum("kip,kiq->pq", by, known)
-            parts.append(np.concatenate([*of_points, *of_poses, own]))
+            incidence = (self._incidence[0][:, few], self._incidence[1][:, few])
+            parts.append(_pulled(rows.select(few), by, self.weights[few], incidence))
         found = reduce(np.add, parts)
         p = found.shape[1]
         return found[:-p], found[-p:]
@@ -751,11 +786,19 @@ def _after(graph: WholeGraph, state: State, solved: SolvedSystem) -> tuple[float
 
 def keys_of(values: Any) -> tuple[list[int], list[int]]:
     """Keys of the poses and of the landmarks among GTSAM values, ascending."""
-    poses: list[int] = []
-    landmarks: list[int] = []
-    for key in values.keys():  # noqa: SIM118 - GTSAM's values do not iterate
-        (poses if is_pose(key) else landmarks).append(key)
-    return poses, landmarks
+    keys = list(values.keys())
+    return [key for key in keys if is_pose(key)], [key for key in keys if is_landmark(key)]
+
+
+def _pulled(
+    rows: LinearRows, by: FloatArray, weights: FloatArray, incidence: tuple[csr_matrix, csr_matrix]
+) -> FloatArray:
+    """(3m + 6n + p, p) of landmarks, poses and p numbers that shift residuals by (k, m, p)."""
+    known, (poses, points) = weights[:, None, None] * by, incidence
+    of_points = _summed(points, np.swapaxes(rows.by_point, 1, 2) @ known)
+    of_poses = _summed(poses, np.swapaxes(rows.by_pose, 1, 2) @ known)
+    own = np.einsum("kip,kiq->pq", by, known)
+    return np.concatenate([*of_points, *of_poses, own])
 
 
 def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from scipy.linalg import blas, lapack, solve_triangular
+from scipy.linalg import blas, block_diag, lapack, solve_triangular
 from scipy.sparse import block_array, bsr_matrix, csc_matrix, csr_matrix, diags_array, identity
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import splu
@@ -286,14 +286,24 @@ class Border:
     """What the p numbers add to the normal equations.
 
     Attributes:
-        by_pose: (6n, p) their coupling to the poses.
+        coupling: (3m + 6n, p) theirs to the landmarks and poses.
         own: (p, p) their information.
         gradient: (p,).
     """
 
-    by_pose: FloatArray
+    coupling: FloatArray
     own: FloatArray
     gradient: FloatArray
+
+    def plus(self, other: Border | None) -> Border:
+        """With those of another one before them."""
+        if other is None:
+            return self
+        return Border(
+            np.hstack([other.coupling, self.coupling]),
+            np.asarray(block_diag(other.own, self.own)),
+            np.concatenate([other.gradient, self.gradient]),
+        )
 
     def damped(self, by: float) -> Border:
         """With so many times the diagonal added to itself."""
@@ -324,14 +334,14 @@ class Bordered:
         Raises:
             EstimatorError: the border is not determined.
         """
-        p, columns = len(border.gradient), held.system.columns
-        coupling = np.concatenate([np.zeros((columns, p)), border.by_pose])
-        gain = held.solve(coupling)
-        information = border.own + coupling.T @ gain
+        gain = held.solve(border.coupling)
+        information = border.own + border.coupling.T @ gain
         try:
             root = np.linalg.inv(np.linalg.cholesky(0.5 * (information + information.T)))
         except np.linalg.LinAlgError:
-            raise EstimatorError("the measurements do not determine a gyroscope's bias") from None
+            raise EstimatorError(
+                "the measurements do not determine a gyroscope's bias, or nuisance parameters"
+            ) from None
         covariance = root.T @ root
         return Bordered(held, gain, covariance, -covariance @ (border.gradient + gain.T @ gradient))
 

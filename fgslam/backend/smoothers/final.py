@@ -20,6 +20,7 @@ from scipy.linalg import block_diag
 
 from fgslam.backend.considered import fused, pixels_of, shared_covariance
 from fgslam.backend.loops import Chain, Constraint, constraint_factor, refusal
+from fgslam.backend.measured import nuisance_words
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
 from fgslam.backend.persistence import STATED, Fitted
 from fgslam.backend.self_calibration import RigChange
@@ -303,7 +304,14 @@ class Refined:
         found = self.marginals
         if self.graph.rest.turns is None or not isinstance(found, Bordered):
             return None
-        return GyroscopeBias(self.state.bias[-3:], found.estimated[-3:, -3:])
+        last = slice(len(self.graph.rest.turns.known) - 3, len(self.graph.rest.turns.known))
+        return GyroscopeBias(self.state.bias[last], found.estimated[last, last])
+
+    @property
+    def nuisance(self) -> dict[str, FloatArray]:
+        """Nuisance parameters (3,) of each kind of measurement that has any."""
+        found = self.graph.rest.nuisances(self.state.bias)
+        return {one.model.kind: values for one, known, values in found if len(known)}
 
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
@@ -472,10 +480,17 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
         remarks = (*refined.remarks, str(error))
-        return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio)
-    bias = refined.gyroscope
+        nuisance = refined.nuisance
+        return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio, nuisance=nuisance)
+    bias, nuisance = refined.gyroscope, refined.nuisance
     remarks = refined.remarks if bias is None else (*refined.remarks, bias.words)
-    return Solution(poses, kept, points, covariances, remarks, True, ratio, bias, relative)
+    if nuisance and isinstance(marginals, Bordered):
+        spread = np.diagonal(marginals.estimated)[-3 * len(nuisance) :].reshape(-1, 3)
+        for (kind, values), variances in zip(nuisance.items(), spread, strict=True):
+            remarks = (*remarks, nuisance_words(kind, values, variances))
+    return Solution(
+        poses, kept, points, covariances, remarks, True, ratio, bias, relative, nuisance
+    )
 
 
 _MOTIONS = 50  # that are judged, evenly spread: each costs a solution of the graph

@@ -60,9 +60,9 @@ from fgslam.core.sensors import (
     Odometry,
 )
 from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
-from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
+from fgslam.factors.graphs import landmark_key, nuisance_key, pose_key, poses_of_frame
 from fgslam.factors.landmark import StereoFactors
-from fgslam.factors.measurement import gtsam_factor, whitening
+from fgslam.factors.measurement import gtsam_factor, nuisance_prior, whitening
 from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
 from fgslam.factors.noise import Whitening, scaled
 
@@ -349,6 +349,8 @@ class GraphBuilder:
         out = self._other_factors()
         out.push_back(self._observation_factors(*self.kept_observed()))
         for one in self.measured.values():
+            if one.model.nuisance.size:
+                out.add(nuisance_prior(one.model))
             if callbacks or one.model.has_factor:
                 out.push_back(one.factors())
         return out
@@ -372,7 +374,10 @@ class GraphBuilder:
     ) -> tuple[WholeGraph, State]:
         """The same in arrays, at values of all variables; with another kernel where given."""
         graph, state = self._whole_graph(values, kernel or self.kernel)
-        return graph.with_turns(list(self._turned.values()), state, self._persistence)
+        graph, state = graph.with_turns(list(self._turned.values()), state, self._persistence)
+        keys = [nuisance_key(k) for k, one in self.measured.items() if one.model.nuisance.size]
+        known = [values.atVector(key) if values.exists(key) else np.zeros(3) for key in keys]
+        return graph, dataclasses.replace(state, bias=np.concatenate([state.bias, *known]))
 
     def _whole_graph(self, values: Any, kernel: KernelSettings) -> tuple[WholeGraph, State]:
         """Without turns of a gyroscope."""
@@ -497,6 +502,9 @@ class GraphBuilder:
                     if seen >= self.admission.first_frame:
                         ready.setdefault(one.kind, []).append((seen, track.variable, one))
         new.measured = [self._sightings(*zip(*known, strict=True)) for known in ready.values()]
+        for model in (one.model for one in new.measured if one.model.nuisance.size):
+            if model.kind not in self.measured:
+                new.values.insert(nuisance_key(model.kind), np.zeros(3))
 
     def _sightings(
         self, frames: Sequence[int], variables: Sequence[int], measured: Sequence[Measured]
@@ -589,6 +597,7 @@ class Solution:
         noise_ratio: variance of the measurements over what the builder takes it to be.
         gyroscope: its bias, where it is a variable of the graph.
         relative: as of :class:`~fgslam.core.types.Estimate`, up to the graph's last frame.
+        nuisance: parameters (3,) of the kinds of measurement that have any.
     """
 
     poses: FloatArray
@@ -600,6 +609,7 @@ class Solution:
     noise_ratio: float = 1.0
     gyroscope: GyroscopeBias | None = None
     relative: Mapping[int, FloatArray] = field(default_factory=dict)
+    nuisance: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 class FactorGraph(NamedTuple):
@@ -628,6 +638,8 @@ def factor_graph(builder: GraphBuilder, found: Solution) -> FactorGraph:
         values.insert(key, gtsam.Pose3(reorthonormalise(found.poses[frame])))
     for variable, point in found.points.items():
         values.insert(landmark_key(variable), point)
+    for kind, parameters in found.nuisance.items():
+        values.insert(nuisance_key(kind), parameters)
     every = builder.kept_factors()
     for factor in map(every.at, range(every.size())):
         if all(map(values.exists, factor.keys())):

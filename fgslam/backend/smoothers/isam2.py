@@ -30,10 +30,12 @@ from fgslam.factors.graphs import (
     is_pose,
     isam2_parameters,
     landmark_key,
+    nuisance_key,
     number,
     pose_key,
     poses_of_frame,
 )
+from fgslam.factors.measurement import nuisance_prior
 
 _REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 _SINGLE = 3  # of these, before Cholesky's rounding is suspected
@@ -64,6 +66,9 @@ class Isam2Solver(WholeGraphSolver):
         self._graph.push_back(new.graph)
         self._graph.push_back(self.builder.observation_factors(new))
         self._linear.measured += [one for one in new.measured if not one.model.has_factor]
+        for model in (one.model for one in new.measured):
+            if new.values.exists(nuisance_key(model.kind)):
+                self._graph.add(nuisance_prior(model))
         self.new_values.insert(new.values)
         self._answer = None
 
@@ -304,7 +309,10 @@ class LinearFactors:
             off = np.maximum(np.abs(here - poses).max((1, 2)), np.abs(seen - points).max(1))
             moved = np.flatnonzero(~(off < RELINEARISED))  # NaN: not in the tree yet
             emptied += slots[moved][slots[moved] >= 0].tolist()
-            rows = there.select(moved).look(state.poses, state.points)
+            new = there.select(moved)
+            rows, more = new.look(state.poses, state.points), new.shifted()
+            key = nuisance_key(one.model.kind)
+            known = values.atVector(key) if more.size else np.empty(0)
             unit = gtsam.noiseModel.Unit.Create(rows.residual.shape[1])
             columns = (
                 one.poses[moved].tolist(),
@@ -312,12 +320,16 @@ class LinearFactors:
                 here[moved],
                 seen[moved],
             )
-            linear = rows.by_pose, rows.by_point, -rows.residual
-            for pose, point, wTx, place, *terms in zip(*columns, *linear, strict=True):
+            linear = rows.by_pose, rows.by_point, more, -rows.residual - more @ known
+            for pose, point, wTx, place, *by, right in zip(*columns, *linear, strict=True):
                 at = gtsam.Values()
                 at.insert(pose, gtsam.Pose3(wTx))
                 at.insert(point, place)
-                factor = gtsam.JacobianFactor(pose, terms[0], point, terms[1], terms[2], unit)
+                terms: list[Any] = [pose, by[0], point, by[1]]
+                if more.size:
+                    at.insert(key, known)
+                    terms += [key, by[2]]
+                factor = gtsam.JacobianFactor(*terms, right, unit)  # type: ignore[call-overload]
                 graph.add(gtsam.LinearContainerFactor(factor, at))
             poses[moved], points[moved] = here[moved], seen[moved]
             self._new.append(moved)

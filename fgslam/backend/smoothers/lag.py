@@ -81,7 +81,7 @@ class FixedLagSolver:
     def __init__(self, problem: GraphProblem, settings: FixedLagSettings) -> None:
         """An empty window."""
         self.builder, self._floor = problem.builder, problem.floor
-        self._lag = settings.lag_frames
+        self._lag, self._tracker = settings.lag_frames, problem.tracker
         self.window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
@@ -192,7 +192,8 @@ class FixedLagSolver:
             )
 
         for one in new.measured:
-            self.window.measure(one)
+            nuisance = self._tracker.nuisance(one.model.kind)
+            self.window.measure(one.considering(*nuisance) if nuisance else one)
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""
