@@ -38,15 +38,18 @@ class Range(LandmarkModel):
 
     kind, size = "range", 1
 
-    def __init__(self, bTs: FloatArray | None = None, offset_sigma_m: float = 0.0) -> None:
-        """Of a sensor on the body; with an offset of all ranges of about so many metres."""
+    def __init__(
+        self, bTs: FloatArray | None = None, offset_sigma_m: float = 0.0, scale_sigma: float = 0.0
+    ) -> None:
+        """Of a sensor on the body; with an unknown offset and scale of so much, to be estimated."""
         super().__init__(bTs)
-        if offset_sigma_m:
-            self.nuisance = np.array([[offset_sigma_m**2]])
+        sigmas = np.array([offset_sigma_m, scale_sigma])
+        self._unknown = sigmas > 0.0
+        self.nuisance = np.diag(sigmas[self._unknown] ** 2)
 
     def shifts(self, z: FloatArray) -> FloatArray:
-        """(k, 1, 1) one for the offset."""
-        return np.ones((*z.shape, len(self.nuisance)))
+        """(k, 1, q) by the offset, and by the scale."""
+        return np.stack([np.ones_like(z), z], axis=2)[:, :, self._unknown]
 
     def predict(self, x: FloatArray) -> FloatArray:
         """(k, 1); at the sensor itself a distance has no direction."""

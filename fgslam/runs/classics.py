@@ -25,11 +25,18 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.types import Trajectory
 from fgslam.datasets.measured import open_stereo_tracks
-from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
+from fgslam.datasets.odometry import pose_noise
+from fgslam.datasets.settings import (
+    ConstantVelocitySettings,
+    RecordedOdometrySettings,
+    StereoTracksSettings,
+)
 from fgslam.datasets.times import read_table
 from fgslam.evaluation.judging import Truth, judge_answer, judge_replay, lone_answer
+from fgslam.factors.models import Height, Range
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.compare import all_kinds
@@ -39,6 +46,7 @@ from fgslam.slam.replay import replay
 GRAPH_KINDS = ("isam2", "batch")
 NO_GRAPH = "filters and windows keep no old pose on which an edge of a graph could close a loop"
 _ON_LANDMARKS = ("ekf", "landmark_kalman", "sliding_window")
+_BY_RANGE = ("odometry", "ekf", "landmark_kalman", "isam2", "batch")
 _TRACKED = ("landmark_kalman", "fixed_lag", "sliding_window", "isam2", "batch")
 
 
@@ -81,9 +89,38 @@ def _sphere() -> FloatArray:
 
 def _city() -> FloatArray:
     rows = read_table(_data("ISAM2_GT_city10000.txt"), ("x", "y", "turn")).values
-    return np.array([pose(so3_exp(np.array([0.0, 0.0, t])), np.array([x, y, 0.0]))
-                     for x, y, t in rows])  # fmt: skip
+    return np.array([_in_plane(*row) for row in rows])
 
+
+def _in_plane(x: float, y: float, turn: float) -> FloatArray:
+    return pose(so3_exp(np.array([0.0, 0.0, turn])), np.array([x, y, 0.0]))
+
+
+def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
+    """A mower's ranges to radios (Djugash and others 2009), a frame each, and where it was."""
+    from scipy.io import loadmat
+
+    file = loadmat(_data(f"{name.capitalize()}_.mat"))
+    steps, ranges, (seconds, *course) = file["DR"], file["TD"], file["GT"].T
+    course[2] = np.unwrap(course[2]) + _HEADING[name]
+    at = np.column_stack([np.interp(ranges[:, 0], seconds, one) for one in course])
+    radios, flat = Range(offset_sigma_m=3.0, scale_sigma=0.1), Height()
+    log, ends = MeasurementLog(), np.searchsorted(steps[:, 0], ranges[:, 0], "right")
+    for k, (stamp, _, radio, distance) in enumerate(ranges):
+        motion = np.eye(4)
+        for _, ahead, turn in steps[ends[k - 1] if k else 0 : ends[k]]:
+            motion = motion @ _in_plane(ahead, 0.0, turn)
+        noise = pose_noise(motion, RecordedOdometrySettings())
+        noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
+        seen = radios.measured(distance, [[_RANGE_SIGMA_M**2]], [int(radio)])
+        stiff = flat.measured(0.0, [[_STIFF]], [int(radio)])
+        log.append(Increment.of(k, stamp, Odometry(motion, noise) if k else None, [seen, stiff]))
+    return log, Trajectory(ranges[:, 0], np.array([_in_plane(*one) for one in at]))
+
+
+_RANGE_SIGMA_M = 0.5  # against the truth, once scaled: white
+_HEADING = {"plaza1": 0.0, "plaza2": np.pi}  # of the course against what the file calls heading
+_STIFF, _OUT_OF_PLANE = 1e-8, np.array([0, 1, 5])  # of [rotation, translation]
 
 _GRAPHS: dict[str, tuple[str, Callable[[], FloatArray] | None]] = {
     "victoria_park": ("victoria_park.txt", None),
@@ -91,7 +128,7 @@ _GRAPHS: dict[str, tuple[str, Callable[[], FloatArray] | None]] = {
     "city10000": ("T1_city10000_04.txt", _city),
     "w10000": ("w10000.graph", None),
 }
-CLASSICS = (*_GRAPHS, "kitti00")
+CLASSICS = (*_GRAPHS, "kitti00", *_HEADING)
 """Their names."""
 
 
@@ -117,6 +154,11 @@ def run_classic(
     """
     if name == "kitti00":
         yield from _tracks(name, steps)
+        return
+    if name in _HEADING:
+        log, mower = _ranges(name)
+        log = MeasurementLog(increments=log.increments[:steps])
+        yield from _replayed(name, log, mower, len(log), _BY_RANGE)
         return
     file, make_truth = _GRAPHS.get(name, (name, None))
     graph = read_graph(_data(file) if name in _GRAPHS else Path(file)).first(steps)

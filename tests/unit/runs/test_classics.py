@@ -32,6 +32,15 @@ def test_graphs_with_truth_are_judged(name: str, steps: int) -> None:
     assert online.chi_square == pytest.approx(batch.chi_square, rel=0.1)
 
 
+def test_ranges_that_are_scaled_locate_a_mower() -> None:
+    """By odometry alone it is lost, as its turns are 5 % too small."""
+    rows = {one.estimator: one for one in run_classic("plaza2", 400)}
+    assert not any(one.why for one in rows.values())
+    assert rows["odometry"].ate_m > 1.5
+    for kind in ("ekf", "isam2", "batch"):
+        assert rows[kind].ate_m < 0.6
+
+
 def test_a_solver_that_is_not_asked_for_does_not_solve() -> None:
     for kind in ("isam2", "batch"):
         assert [one.estimator for one in run_classic("w10000", 40, [kind])] == [kind]
