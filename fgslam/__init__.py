@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fgslam.core.types import Features, Trajectory
     from fgslam.evaluation.judging import compare
     from fgslam.factors.measurement import LandmarkModel, PoseModel
+    from fgslam.factors.models import Position, Range, RangeBearing
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.route import PathMemory
     from fgslam.homing.steering import DriveCommand
@@ -65,6 +66,9 @@ __all__ = [
     "PathFollower",
     "PathMemory",
     "PoseModel",
+    "Position",
+    "Range",
+    "RangeBearing",
     "Refusal",
     "Result",
     "RigMemory",
@@ -107,6 +111,9 @@ _HOMES = {
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.route",
     "PoseModel": "fgslam.factors.measurement",
+    "Position": "fgslam.factors.models",
+    "Range": "fgslam.factors.models",
+    "RangeBearing": "fgslam.factors.models",
     "Refusal": "fgslam.core.bearings",
     "Result": "fgslam.runs.session",
     "RigMemory": "fgslam.slam.rig_memory",

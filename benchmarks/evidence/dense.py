@@ -60,7 +60,7 @@ def tables(data: Path) -> list[Table]:
 
 def _run(name: str, folder: Path) -> Path:
     say(f"runs {name}")
-    return fgslam.run(name, folder / Path(name).name).folder
+    return fgslam.run(name, out=folder / Path(name).name).folder
 
 
 def _open(name: str) -> RenderedLabSequence:

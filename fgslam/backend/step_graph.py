@@ -19,10 +19,10 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import compose_covariance
 from fgslam.core.log import MeasurementLog
-from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.sensors import Increment, Measured, Odometry
 from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory
 from fgslam.factors.graphs import solver_parameters
-from fgslam.factors.models import RangeBearing
+from fgslam.factors.models import Height, Range, RangeBearing
 
 _IN_SPACE = re.compile(r"^(EDGE3|VERTEX3|EDGE_SE3|VERTEX_SE3)", re.MULTILINE)
 _TAGS = (
@@ -198,6 +198,13 @@ def log_of(graph: StepGraph) -> MeasurementLog:
             log.append(Increment.of(key, float(key), odometry, measured))
             motion, noise = np.eye(4), np.zeros((6, 6))
     return log
+
+
+def range_in_plane(distance_m: float, sigma_m: float, landmark: int) -> tuple[Measured, Measured]:
+    """A range, of a sensor whose offset and scale are unknown, of a landmark as high as it is."""
+    ranges = Range(offset_sigma_m=3.0, scale_sigma=0.1)
+    flat = Height().measured(0.0, [[_STIFF]], [landmark])
+    return ranges.measured(distance_m, [[sigma_m**2]], [landmark]), flat
 
 
 def _begun(graph: StepGraph, factor: Any, key: int, known: dict[int, Any]) -> Any:

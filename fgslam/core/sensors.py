@@ -140,6 +140,8 @@ class Measured(Rows):
     """
 
     SHARED = frozenset({"kind", "model"})
+    FIRST_ID = 10**9
+    """Of landmarks of other sensors in a session with cameras, which count theirs from 0."""
 
     kind: str
     values: FloatArray

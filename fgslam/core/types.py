@@ -492,6 +492,11 @@ class LandmarkMap(Rows):
     positions: FloatArray
     covariances: FloatArray
 
+    def below(self, identity: int) -> LandmarkMap:
+        """The landmarks of smaller identities; a view."""
+        n = np.searchsorted(self.ids, identity)
+        return LandmarkMap(self.ids[:n], self.positions[:n], self.covariances[:n])
+
     def without(self, ids: IntArray) -> LandmarkMap:
         """The map but for these landmarks, as a new value."""
         return self.select(~np.isin(self.ids, ids))

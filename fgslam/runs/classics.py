@@ -17,6 +17,7 @@ from fgslam.backend.step_graph import (
     SolvedGraph,
     log_of,
     motions_chained,
+    range_in_plane,
     read_graph,
     solve_at_once,
     solve_by_steps,
@@ -36,7 +37,6 @@ from fgslam.datasets.settings import (
 )
 from fgslam.datasets.times import read_table
 from fgslam.evaluation.judging import Truth, judge_answer, judge_replay, lone_answer
-from fgslam.factors.models import Height, Range
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.compare import all_kinds
@@ -104,7 +104,6 @@ def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
     steps, ranges, (seconds, *course) = file["DR"], file["TD"], file["GT"].T
     course[2] = np.unwrap(course[2]) + _HEADING[name]
     at = np.column_stack([np.interp(ranges[:, 0], seconds, one) for one in course])
-    radios, flat = Range(offset_sigma_m=3.0, scale_sigma=0.1), Height()
     log, ends = MeasurementLog(), np.searchsorted(steps[:, 0], ranges[:, 0], "right")
     for k, (stamp, _, radio, distance) in enumerate(ranges):
         motion = np.eye(4)
@@ -112,9 +111,8 @@ def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
             motion = motion @ _in_plane(ahead, 0.0, turn)
         noise = pose_noise(motion, RecordedOdometrySettings())
         noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
-        seen = radios.measured(distance, [[_RANGE_SIGMA_M**2]], [int(radio)])
-        stiff = flat.measured(0.0, [[_STIFF]], [int(radio)])
-        log.append(Increment.of(k, stamp, Odometry(motion, noise) if k else None, [seen, stiff]))
+        seen = range_in_plane(distance, _RANGE_SIGMA_M, int(radio))
+        log.append(Increment.of(k, stamp, Odometry(motion, noise) if k else None, seen))
     return log, Trajectory(ranges[:, 0], np.array([_in_plane(*one) for one in at]))
 
 

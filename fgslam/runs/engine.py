@@ -38,6 +38,8 @@ from fgslam.runs.units import Done, Progress, Stopped, UnitStore, holds_units
 from fgslam.runs.workers import Argument, Executor, Failed, Pool, Result
 
 if TYPE_CHECKING:
+    from fgslam.backend.settings import EstimatorSettings
+    from fgslam.backend.smoothers.graph import FactorGraph
     from fgslam.core.log import ImageSequence, MeasurementRecording
     from fgslam.datasets.omni import OmniRecording
     from fgslam.runs.dense import DenseMap
@@ -119,6 +121,19 @@ class RunResult:
     def metrics(self) -> dict[str, Any]:
         """The document of metrics.json. Raises DatasetError where there is none."""
         return read_metrics(self.folder / METRICS_FILE)
+
+    def graph(self, estimator: str | EstimatorSettings | None = None) -> FactorGraph:
+        """The log of a run of SLAM as GTSAM's factor graph, as :func:`fgslam.graph` gives it.
+
+        Args:
+            estimator: whose solution; None for the one that steered.
+
+        Raises:
+            FgslamError: no run of SLAM, or the estimator keeps no whole graph.
+        """
+        from fgslam.runs.export import graph_of_run  # loads all of the back-end
+
+        return graph_of_run(self.folder, estimator)
 
     def dense_map(self, estimator: str | None = None, **how: Any) -> DenseMap:
         """All that the images of a run of SLAM show: ``surface``, and ``grid`` to drive by.

@@ -11,8 +11,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgslam.backend.settings import EstimatorSettings
+from fgslam.backend.smoothers.graph import FactorGraph
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
-from fgslam.core.errors import ConfigError, DatasetError, FrameError, OutputError
+from fgslam.core.errors import (
+    ConfigError,
+    DatasetError,
+    EstimatorError,
+    FrameError,
+    OutputError,
+)
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
 from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
@@ -51,6 +59,8 @@ from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
 from fgslam.runs.units import Progress
+from fgslam.slam.build import chosen_estimator
+from fgslam.slam.replay import replay
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +215,20 @@ def dense_map(
     estimate = Estimate(trajectory, covariances, NO_LANDMARKS).of("right", log.rig)
     rows, pictures, depths = frames_of(config_of(run, recording), estimate.trajectory)
     return fuse(log, estimate, rows, pictures, depths, how, progress)
+
+
+def graph_of_run(run: Path, estimator: str | EstimatorSettings | None = None) -> FactorGraph:
+    """The log of a run as GTSAM's graph at the solution of an estimator, the run's own for None.
+
+    Raises:
+        FgslamError: no run of SLAM, or the estimator fails on its log or keeps no whole graph.
+    """
+    config, log = load_config(run / RUN_MARKER), MeasurementLog.load(log_of(run))
+    chosen = chosen_estimator(estimator or config.estimator)
+    found = replay(log, chosen, config.frontend.ego_motion)
+    if found.failure:
+        raise EstimatorError(f"{found.kind}: {found.failure}")
+    return found.graph()
 
 
 def _require_outputs(run: Path, wanted: Wanted) -> None:

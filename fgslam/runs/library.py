@@ -10,7 +10,6 @@ from typing import Any, TypeAlias, cast, get_args
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.backend.smoothers.graph import FactorGraph
-from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import (
     ConfigError,
@@ -36,7 +35,7 @@ from fgslam.runs.session import Overrides, override_texts, slam_config
 from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
 from fgslam.runs.units import Progress
 from fgslam.runs.workers import Pool
-from fgslam.slam.build import chosen_estimator, is_settings, make_estimator
+from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 
@@ -173,8 +172,8 @@ def _checked_existing(existing: ExistingFolder) -> ExistingFolder:
 
 def run(
     experiment: str | Path,
-    out: str | Path | None = None,
     overrides: Overrides = (),
+    out: str | Path | None = None,
     existing: ExistingFolder = "refuse",
     progress: Progress = lambda what, done, total: None,
     camera: str | Path | None = None,
@@ -184,8 +183,8 @@ def run(
     Args:
         experiment: a recording's folder, the name of an experiment that comes with fgslam, or a
             YAML file.
-        out: the run folder; None for runs/NAME.
         overrides: settings that differ, by dotted key: ``{"seed": 3}``; or texts: ``["seed=3"]``.
+        out: the run folder; None for runs/NAME.
         existing: what to do where the folder holds a run: `refuse`, `overwrite` or `resume`.
         progress: called with what is under way, how much of it is done, and of how much.
         camera: of a recording: calibration file in place of its own.
@@ -267,8 +266,9 @@ def replay(
             None for the defaults.
 
     Returns:
-        Trajectory, covariances and map, with numbers of every frame. An estimator that fails ends
-        its replay, not the program: ``failure`` states where and why.
+        ``trajectory``, ``covariances``, ``map`` and ``graph()``, as a session's result has them,
+        with numbers of every frame. An estimator that fails ends its replay, not the program:
+        ``failure`` states where and why.
 
     Raises:
         ConfigError: no such estimator.
@@ -318,13 +318,7 @@ def graph(
         EstimatorError: it fails on this log.
         MeasurementLogError: as of :func:`replay`.
     """
-    chosen = chosen_estimator(estimator)
-    made = make_estimator(log.rig, chosen, ego_motion) if is_settings(chosen) else chosen
-    if not isinstance(made, MapSmoother):
-        raise ConfigError(
-            f"estimator: {made.kind} keeps no whole graph; use batch, isam2 or sliding_window"
-        )
-    failure = replay(log, made, ego_motion).failure
-    if failure:
-        raise EstimatorError(f"{made.kind}: {failure}")
-    return made.graph()
+    found = replay(log, estimator, ego_motion)
+    if found.failure:
+        raise EstimatorError(f"{found.kind}: {found.failure}")
+    return found.graph()

@@ -24,7 +24,7 @@ from fgslam.core.log import Frame, MeasurementLog
 from fgslam.core.open3d_library import load_open3d
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Measured, Odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Estimate, LandmarkMap, Relocalisation, Trajectory
 from fgslam.datasets.layouts import is_recording
@@ -541,12 +541,13 @@ class Slam(Session):
         t: float,
         images: Images | None,
         odometry: Odometry | npt.ArrayLike | None = None,
+        measurements: Iterable[Measured] = (),
     ) -> Step:
         """As :meth:`fgslam.slam.session.Session.track`; the map keeps colours.
 
         Those of the right image where a landmark begins, of images (height, width, 3).
         """
-        step = super().track(t, images, odometry)
+        step = super().track(t, images, odometry, measurements)
         shown = [] if images is None else [image for image in images if image is not None]
         coloured = len(shown) == self.rig.cameras and np.shape(shown[1])[2:] in _CHANNELS
         if coloured and len(self.recorder):
@@ -566,11 +567,13 @@ class Slam(Session):
             SessionError: there is no frame yet.
         """
         found = super().result()
-        points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
+        seen = found.estimate.landmarks.below(Measured.FIRST_ID)
+        points = map_points(seen, self.pipeline.tracker.database)
         for row, identity in enumerate(points.ids.tolist()):
             points.colours[row] = self._colours.get(identity, points.colours[row])
         drive = {"remark": self._remark, "remarks": list(map(sentence, found.remarks))}
-        saved = map_of(self, found.estimate, self._before, name="session", **drive)
+        estimate = replace(found.estimate, landmarks=seen)
+        saved = map_of(self, estimate, self._before, name="session", **drive)
         if self._colours:
             rows = np.searchsorted(points.ids, saved.landmarks.ids)
             saved = replace(saved, colours=points.colours[rows])

@@ -13,7 +13,13 @@ import numpy as np
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import RigCorrection
-from fgslam.core.sensors import CAMERA_NAMES, Increment, LoopClosure, Odometry
+from fgslam.core.sensors import (
+    CAMERA_NAMES,
+    Increment,
+    LoopClosure,
+    Measured,
+    Odometry,
+)
 from fgslam.core.stopwatch import Stopwatch, timed
 from fgslam.core.store import Kept, has_state, put_back, snapshot
 from fgslam.core.types import (
@@ -91,7 +97,12 @@ class SlamPipeline:
         self.witnesses = Witnesses(self.tracker, self.estimator.kind != "odometry")
 
     def process(
-        self, frame: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
+        self,
+        frame: FeatureFrame,
+        index: int,
+        timestamp: float,
+        body: Odometry | None = None,
+        measured: tuple[Measured, ...] = (),
     ) -> FrameReport:
         """Processes one frame: Sections 2 to 4 of the paper in order, then loops (its section 7).
 
@@ -100,6 +111,7 @@ class SlamPipeline:
             index: its number in the recording, for the log.
             timestamp: seconds.
             body: the robot's motion since the last frame; None where none was measured.
+            measured: by other sensors.
         """
         self.watch_of_frame = Stopwatch()
         before = self._before()
@@ -123,7 +135,7 @@ class SlamPipeline:
             stereo = features = every.whole
             matched = self._recognise_places(matched, stereo, landmarks)
         matched = self._end_landmarks(matched)
-        increment = self._increment(index, timestamp, matched)  # what the log holds
+        increment = self._increment(index, timestamp, matched, measured)  # what the log holds
         stats, noise = self._update(increment, matched.ego_motion)  # 6.4
         if features is not None and not _known(matched.odometry):
             self._look_for_other_motion(index, features, matched, stats)
@@ -188,7 +200,7 @@ class SlamPipeline:
 
         The estimator drops these with this frame's measurements, as the log records it.
         """
-        landmarks = self.estimator.landmarks()
+        landmarks = self.estimator.landmarks().below(Measured.FIRST_ID)
         if self.places is not None:
             self._ended = np.union1d(self._ended, self.places.fuse(landmarks))
         return landmarks.without(self._ended) if len(self._ended) else landmarks
@@ -316,7 +328,9 @@ class SlamPipeline:
         association = dataclasses.replace(matched.association, pruned_ids=pruned)
         return dataclasses.replace(matched, association=association)
 
-    def _increment(self, index: int, timestamp: float, matched: Matched) -> Increment:
+    def _increment(
+        self, index: int, timestamp: float, matched: Matched, measured: tuple[Measured, ...]
+    ) -> Increment:
         association, calibration = matched.association, self.calibration
         return Increment(
             index=index,
@@ -330,6 +344,7 @@ class SlamPipeline:
             relocalised=matched.relocalised,
             rig_correction=self.stated if calibration is None else calibration.found.applied.values,
             settled_rig=None if calibration is None else calibration.settled,
+            measured=measured,
         )
 
     @timed("update")

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.core.arrays import Brief, FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, MeasurementType, Observations
@@ -32,6 +32,7 @@ from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     Estimate,
+    LandmarkMap,
     Prediction,
     Trajectory,
     UpdateStats,
@@ -43,7 +44,7 @@ from fgslam.slam.bridging import bridged
 from fgslam.slam.build import Arrival, made_or_given, take_over
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
 from fgslam.slam.pipeline import FrameNoise, noise_in_use, observe
-from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
+from fgslam.slam.results import ESTIMATOR_FAULTS, Answered, estimate_of_failed, reason
 
 _PROC_STATUS = Path("/proc/self/status")
 
@@ -62,7 +63,7 @@ class ReplayRow(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Replay(Brief):
+class Replay(Answered):
     """Result of an estimator on a replayed log.
 
     Attributes:
@@ -79,6 +80,7 @@ class Replay(Brief):
         failure: empty, or at which frame and why the estimator ended early.
         closed: of the log's loop closures so far, in their order, whether it took them.
         noise: that each frame was estimated with.
+        estimator: as it is after the last frame; None where it could not be made.
     """
 
     title: str
@@ -93,6 +95,12 @@ class Replay(Brief):
     failure: str = ""
     closed: tuple[bool, ...] = ()
     noise: tuple[FrameNoise, ...] = ()
+    estimator: Estimator | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def map(self) -> LandmarkMap:
+        """The landmarks: identities, positions, covariances."""
+        return self.estimate.landmarks
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -307,4 +315,5 @@ class _Replaying:
             failure=failure,
             closed=tuple(self._closed),
             noise=tuple(self._noise),
+            estimator=estimator,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import WeighedCorrection
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
-from fgslam.core.errors import FgslamError
+from fgslam.core.errors import ConfigError, FgslamError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Observations
 from fgslam.core.store import Kept
@@ -29,6 +29,9 @@ from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged_frames
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameNoise, FrameReport, SlamPipeline
+
+if TYPE_CHECKING:
+    from fgslam.backend.smoothers.graph import FactorGraph
 
 STAGES = (
     "load",
@@ -227,8 +230,41 @@ class Step(Brief):
         )
 
 
+class Answered(Brief):
+    """The parts that results of sessions and of replays share."""
+
+    __slots__ = ()
+    estimate: Estimate
+    estimator: Estimator | None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """All poses ``wTc`` of the right camera as known now, n of them."""
+        return self.estimate.trajectory
+
+    @property
+    def covariances(self) -> FloatArray:
+        """(n, 6, 6) of the poses, as in :class:`Step`; NaN where one cannot be had."""
+        return self.estimate.covariances
+
+    def graph(self) -> FactorGraph:
+        """The estimator's factor graph of all frames so far, at its solution.
+
+        Raises:
+            ConfigError: it keeps no whole graph.
+        """
+        made = getattr(self.estimator, "graph", None)
+        if made is None:
+            raise ConfigError(
+                f"estimator: {getattr(self.estimator, 'kind', None)} keeps no whole graph; use "
+                "batch, isam2 or sliding_window"
+            )
+        found: FactorGraph = made()
+        return found
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SessionResult(Brief):
+class SessionResult(Answered):
     """Everything that a session knows at one moment.
 
     Attributes:
@@ -241,6 +277,7 @@ class SessionResult(Brief):
         notes: remarks on frames, cameras and images, and on frames left out.
         rig: what the drive shows of the rig's calibration: estimated, with its covariance, and
             applied; None where the calibration is taken as it is stated.
+        estimator: of whom all this is known.
     """
 
     kind: str
@@ -251,22 +288,13 @@ class SessionResult(Brief):
     frames: dict[str, npt.NDArray[Any]]
     notes: tuple[Remark | str, ...]
     rig: WeighedCorrection | None
+    estimator: Estimator | None = field(repr=False)
 
     # What a comparison of estimators asks of a replay, and a live session does not know.
     failure = ""
     final_ms = math.nan
     memory_before_mb = None
     peak_memory_mb = None
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """All poses ``wTc`` of the right camera as known now, n of them."""
-        return self.estimate.trajectory
-
-    @property
-    def covariances(self) -> FloatArray:
-        """(n, 6, 6) of the poses, as in :class:`Step`; NaN where one cannot be had."""
-        return self.estimate.covariances
 
     @property
     def remarks(self) -> tuple[Remark | str, ...]:
@@ -308,6 +336,7 @@ def result_of(
         | {"connected": connected_frames(recorder, pipeline.tracker.parts)},
         notes=notes,
         rig=None if pipeline.calibration is None else pipeline.calibration.found,
+        estimator=pipeline.estimator,
     )
 
 

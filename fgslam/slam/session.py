@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,10 +17,16 @@ from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import later_time, require_seed
-from fgslam.core.errors import ConfigError, FrameError, OdometryError, SessionError
+from fgslam.core.errors import (
+    ConfigError,
+    FrameError,
+    MeasurementLogError,
+    OdometryError,
+    SessionError,
+)
 from fgslam.core.geometry import is_rigid
 from fgslam.core.log import Frame, MeasurementLog
-from fgslam.core.sensors import CameraRig, Odometry, compose_odometry
+from fgslam.core.sensors import CameraRig, Measured, Odometry, compose_odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import LandmarkMap, Remark, Trajectory
 from fgslam.datasets.odometry import pose_noise
@@ -150,6 +156,7 @@ class Session:
         t: float,
         images: Images | None,
         odometry: Odometry | FloatArray | npt.ArrayLike | None = None,
+        measurements: Iterable[Measured] = (),
     ) -> Step:
         """Takes in the next frame; returns its pose and what was matched.
 
@@ -165,8 +172,11 @@ class Session:
                 in its frame before, metres, with the noise of the odometry settings; or an
                 :class:`Odometry` with its own covariance. None where none was measured: constant
                 velocity. That of the first frame is ignored.
+            measurements: by other sensors, one item a kind, as ``model.measured(...)`` makes them;
+                identities of landmarks from ``fgslam.Measured.FIRST_ID`` on.
 
         Raises:
+            MeasurementLogError: a measurement is none, or of a smaller identity.
             FrameError: wrong number, size, type or shape of images, or the time does not increase.
             OdometryError: the odometry is not finite, of another shape, or no rigid motion.
             SessionError: the session is closed, or its estimator failed before.
@@ -178,6 +188,7 @@ class Session:
         i = self._left_out.count if self._start is not None else len(self.recorder)
         timestamp = later_time(t, self._last_time(), "session", FrameError)
         body = checked_odometry(odometry, self._odometry) if i else None
+        measured = checked_measurements(measurements)
         images, alone = _completed(images, self.rig)
         checked = None if images is None else checked_images(images, self.rig)
         frame = None if checked is None else Frame(i, timestamp, checked, self._margins, alone)
@@ -193,14 +204,14 @@ class Session:
                     # An extractor that fails does so before anything has changed.
                     now, body = self.describer.of_reference(replace(found, i=0)), None
                     self._begin_again(timestamp)
-                report = self.advance(now, timestamp, body)
+                report = self.advance(now, timestamp, body, measured=measured)
                 if images is not None and not found.features:
                     self._seen.add(report.found, any_uint16(images))
                 return Step.of(report)
             if not self._arrives(self._start, found, timestamp):
                 return Step.not_located(timestamp, len(self.pipeline.tracker.database))
             first = found if every else bare  # then measured as every key frame is
-            return Step.of(self.advance(replace(first, i=0), timestamp))
+            return Step.of(self.advance(replace(first, i=0), timestamp, measured=measured))
 
     def advance(
         self,
@@ -210,6 +221,7 @@ class Session:
         index: int | None = None,
         wait_ms: float = 0.0,
         precision_of: Callable[[FrameReport], float] | None = None,
+        measured: tuple[Measured, ...] = (),
     ) -> FrameReport:
         """Takes in a frame whose features are known: what :meth:`track` does after finding them.
 
@@ -220,12 +232,13 @@ class Session:
             index: number of the frame in its recording, for the log; None: by ``numbering``.
             wait_ms: time that the loop waited for this frame, for the record.
             precision_of: fraction of right stereo matches, where truth is known.
+            measured: by other sensors, checked.
         """
         self._require_open()
         first, stride = self.numbering
         index = first + stride * found.i if index is None else index
         try:
-            report = self.pipeline.process(found, index, timestamp, self._usable(body))
+            report = self.pipeline.process(found, index, timestamp, self._usable(body), measured)
             precision = float("nan") if precision_of is None else precision_of(report)
             self.recorder.add(report, wait_ms, precision)
         except BaseException as error:
@@ -479,6 +492,22 @@ def _size(rig: CameraRig) -> tuple[int, int]:
 def _is_colour(image: np.ndarray) -> bool:
     """Whether an array is one image with colours, and not several images."""
     return image.ndim == 3 and image.shape[2] in (3, 4)
+
+
+def checked_measurements(given: Iterable[Measured]) -> tuple[Measured, ...]:
+    """Raises MeasurementLogError for other things, and for identities that are the cameras'."""
+    measured = tuple(given)
+    for one in measured:
+        if not isinstance(one, Measured):
+            raise MeasurementLogError(
+                f"measurements: a {type(one).__name__}; give what model.measured(...) makes"
+            )
+        if len(one.ids) and one.ids.min() < Measured.FIRST_ID:
+            raise MeasurementLogError(
+                f"measurements: identity {one.ids.min()} of {one.kind} may be a camera's landmark; "
+                "add fgslam.Measured.FIRST_ID"
+            )
+    return measured
 
 
 def checked_odometry(

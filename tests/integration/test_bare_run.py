@@ -27,7 +27,7 @@ UNSEEN = {"output.pictures": False, "output.report": False}
 @pytest.fixture(scope="module")
 def bare(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the recording alone, without pictures and page; read only."""
-    return fg.run(recording, tmp_path_factory.mktemp("runs") / "bare", UNSEEN).folder
+    return fg.run(recording, UNSEEN, tmp_path_factory.mktemp("runs") / "bare").folder
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -66,7 +66,7 @@ def test_truth_in_the_folder_changes_nothing_but_the_evaluation(
 ) -> None:
     blind = Path(shutil.copytree(recording, tmp_path / "boards"))
     (blind / "gt_right_cam.txt").unlink()
-    unseen = fg.run(blind, tmp_path / "unseen", UNSEEN)
+    unseen = fg.run(blind, UNSEEN, tmp_path / "unseen")
     paths = [name for name in MEASURED if name.endswith((".tum", "covariance.csv"))]
     same = tuple(name for name in MEASURED if name not in paths)
     assert bytes_of(bare, same) == bytes_of(unseen.folder, same)
@@ -99,7 +99,7 @@ def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
     By the default estimator: one Kalman filter a landmark reports 5 cm there, and errs by as much.
     """
     path = shared_data / "euroc_v101_kf100"
-    run = fg.run(path, tmp_path / "run", {**UNSEEN, "dataset.stop": 18})
+    run = fg.run(path, {**UNSEEN, "dataset.stop": 18}, tmp_path / "run")
     numbers = run.metrics["estimators"][DEFAULT_ESTIMATOR]
     assert sum(run.metrics["status_counts"].values()) == 18
     assert set(run.metrics["status_counts"]) == {"first", "ok", "relocalised"}

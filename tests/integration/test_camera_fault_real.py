@@ -41,7 +41,7 @@ def test_the_end_of_a_drive_with_a_late_camera_is_as_uncertain_as_it_is_wrong(
         "output.pictures": False,
         "output.report": False,
     }
-    result = fg.run("kitti06", tmp_path / "run", settings)
+    result = fg.run("kitti06", settings, tmp_path / "run")
     found = metrics_of(tmp_path / "run")
     own = found["estimators"][KIND]
     deviations = own["end_error_m"] / own["last_pose_sigma"]["position_m"]

@@ -271,7 +271,7 @@ def test_evo_finds_the_runs_own_error(
     root, run = shared_data / name, tmp_path / "run"
     if not root.is_dir():
         pytest.skip(f"no recording {name} in {shared_data}: this test needs it")
-    result = fg.run(root, run, {"dataset.stop": 15, "output.report": False})
+    result = fg.run(root, {"dataset.stop": 15, "output.report": False}, run)
     (kind, numbers), *_ = result.metrics["estimators"].items()
     export_run(run, Wanted(trajectory=tmp_path / "exported.tum"))
     for path in (run / kind / "final.tum", tmp_path / "exported.tum"):

@@ -222,7 +222,7 @@ def test_a_robot_that_is_carried_off_is_lost_finds_its_place_again_and_reaches_t
 def test_the_experiment_of_crossroads_drives_over_both_routes(tmp_path: Path, back: bool) -> None:
     """Its shortest pair of routes, nine path images each: there, and back."""
     given = {"seed": 6, "trials": 1, "back": back, "output.report": False, "output.pictures": 0}
-    result = fg.run("crossroads", tmp_path / "run", given)
+    result = fg.run("crossroads", given, tmp_path / "run")
     assert result.status == "finished"
     assert result.metrics["arrived"] == result.metrics["drives"] == 1
     assert result.metrics["false_arrivals"] == 0

@@ -63,6 +63,17 @@ def test_the_same_estimate_in_a_bag_is_judged_alike(
         assert theirs.loc["drive", name] == pytest.approx(ours.loc["drive", name], rel=1e-3)
 
 
+def test_a_run_has_the_graph_of_its_log(tmp_path: Path) -> None:
+    values = VALUES | {"dataset": VALUES["dataset"] | {"stop": 5}}
+    with units_in_this_process():
+        run = run_experiment(make_config(values, "test"), tmp_path / "short")
+    graph, found, poses, _ = run.graph("batch")
+    assert len(poses) == 5
+    assert graph.error(found) < graph.size()
+    with pytest.raises(fg.errors.ConfigError, match="landmark_kalman keeps no whole graph"):
+        run.graph()
+
+
 def test_halves_of_the_landmarks_judge_a_run_without_truth(run: Path) -> None:
     judged = fg.judge(run)
     assert any("two halves of the landmarks" in note for note in judged.notes)

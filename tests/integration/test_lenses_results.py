@@ -93,7 +93,7 @@ def extent_m(positions: FloatArray) -> float:
 def test_a_drone_that_stands_stays_where_it_is(shared_data: Path, tmp_path: Path) -> None:
     """Ten raw pairs over 3 s; the truth's own extent is 2.1 mm. Measured: 1.7 mm, sigma 0.3 mm."""
     root = shared_data / "stereo_raw" / "euroc_V1_01_cut"
-    out = fg.run(root, tmp_path / "run", UNSEEN).folder / DEFAULT_ESTIMATOR
+    out = fg.run(root, UNSEEN, tmp_path / "run").folder / DEFAULT_ESTIMATOR
     found = Trajectory.load(out / "final.tum")
     truth = np.loadtxt(root / "groundtruth_tum.txt")
     nearest = np.abs(truth[:, :1] - found.timestamps).argmin(axis=0)
@@ -110,7 +110,7 @@ def test_a_drone_that_stands_stays_where_it_is(shared_data: Path, tmp_path: Path
 @pytest.mark.data
 def test_colour_and_depth_of_a_hand_are_located(shared_data: Path, tmp_path: Path) -> None:
     """Fifteen blurred frames, bare; measured: all located, ATE 1.04 cm."""
-    metrics = metrics_of(fg.run(shared_data / "rgbd_fr1", tmp_path / "run", UNSEEN).folder)
+    metrics = metrics_of(fg.run(shared_data / "rgbd_fr1", UNSEEN, tmp_path / "run").folder)
     counts = metrics["status_counts"]
     assert sum(counts.get(name, 0) for name in ("first", "ok", "capped", "relocalised")) >= 14
     assert metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.015

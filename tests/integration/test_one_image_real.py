@@ -28,7 +28,7 @@ def test_five_percent_of_single_images_missing_cost_no_accuracy(
             link = spoilt / file.relative_to(source)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(file)
-    fg.run(spoilt, tmp_path / "run", {"output.pictures": False, "output.report": False})
+    fg.run(spoilt, {"output.pictures": False, "output.report": False}, tmp_path / "run")
     metrics = metrics_of(tmp_path / "run")
     assert metrics["status_counts"]["one_image"] == gone.sum() == 10
     # The complete recording has 1.5 cm; with the whole frames thrown away it were 7.5.

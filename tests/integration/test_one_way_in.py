@@ -61,7 +61,7 @@ def assert_same_files(live: Path, runs: list[Path], estimator: str) -> None:
 def test_rendered_frames_give_the_same_bytes_on_every_way_in(tmp_path: Path) -> None:
     overrides = QUIET | {"dataset.stop": 8, "estimator.kind": "isam2", "compare": []}
     live = pushed("lab_loop", overrides, tmp_path / "live")
-    run = fg.run("lab_loop", tmp_path / "run", overrides)
+    run = fg.run("lab_loop", overrides, tmp_path / "run")
     assert run.status == "finished"
     assert run.metrics["frames"] == 8
     command = by_command("lab_loop", overrides, tmp_path / "command")
@@ -78,7 +78,7 @@ def test_a_session_in_a_saved_map_gives_the_bytes_of_the_configured_run(
     assert (first / "map.ply").is_file()
     later = lab | {"dataset.start": 3, "dataset.stop": 8, "map.load": place, "map.extend": extend}
     live = pushed("lab_loop", later, tmp_path / "live")
-    run = fg.run("lab_loop", tmp_path / "run", later)
+    run = fg.run("lab_loop", later, tmp_path / "run")
     assert_same_files(live, [run.folder], "landmark_kalman")
 
     config = lab | {"dataset.start": 3, "dataset.stop": 8}
@@ -174,15 +174,15 @@ def test_recorded_frames_give_the_same_bytes_on_every_way_in(
         "compare": [],
     }
     live = pushed("kitti06", overrides, tmp_path / "live")
-    run = fg.run("kitti06", tmp_path / "run", overrides)
+    run = fg.run("kitti06", overrides, tmp_path / "run")
     command = by_command("kitti06", overrides, tmp_path / "command")
     assert_same_files(live, [run.folder, command], "landmark_kalman")
 
 
 def test_a_run_is_not_overwritten_unasked(tmp_path: Path) -> None:
     overrides = QUIET | {"dataset.stop": 2, "compare": []}
-    fg.run("lab_loop", tmp_path / "run", overrides)
+    fg.run("lab_loop", overrides, tmp_path / "run")
     with pytest.raises(OutputError, match="holds a run already"):
-        fg.run("lab_loop", tmp_path / "run", overrides)
-    again = fg.run("lab_loop", tmp_path / "run", overrides, existing="overwrite")
+        fg.run("lab_loop", overrides, tmp_path / "run")
+    again = fg.run("lab_loop", overrides, tmp_path / "run", existing="overwrite")
     assert again.metrics["frames"] == 2

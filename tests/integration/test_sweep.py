@@ -85,7 +85,7 @@ def test_a_sweep_from_the_command_line_and_from_python_gives_the_same_bytes(
     assert table.ate_final_m.nunique() == 8
     assert table.frames.tolist() == table["dataset.stop"].tolist()
     # A case is what the experiment gives by itself.
-    fgslam.run(drive, tmp_path / "alone", {"seed": 1, "dataset.stop": 3})
+    fgslam.run(drive, {"seed": 1, "dataset.stop": 3}, tmp_path / "alone")
     alone = json.loads((tmp_path / "alone" / "metrics.json").read_text(encoding="utf-8"))
     assert alone["estimators"]["odometry"]["ate_rmse_m"] == pytest.approx(
         table.ate_final_m[4], rel=1e-12

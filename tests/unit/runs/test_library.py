@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 from pathlib import Path
 from types import ModuleType
@@ -98,9 +99,54 @@ def test_a_replay_of_the_log_gives_the_live_result(
     slam.log.save(tmp_path / "drive.npz")
     replayed = fg.replay(fg.MeasurementLog.load(str(tmp_path / "drive.npz")), "landmark_kalman")
     assert not replayed.failure
-    np.testing.assert_allclose(
-        replayed.estimate.trajectory.poses, live.trajectory.poses, rtol=0, atol=1e-12
-    )
+    np.testing.assert_array_equal(replayed.trajectory.poses, live.trajectory.poses)
+    np.testing.assert_array_equal(replayed.covariances, live.covariances)
+    np.testing.assert_array_equal(replayed.map.positions, live.map.positions)
+
+
+def test_results_have_their_estimator_s_graph(driven: tuple[fg.Slam, fg.Result]) -> None:
+    slam, live = driven
+    graph, values, poses, landmarks = fg.replay(slam.log, "batch").graph()
+    assert len(poses) == FRAMES
+    assert set(landmarks) <= set(live.map.ids.tolist())
+    assert graph.size() == fg.graph(slam.log).graph.size()
+    assert graph.error(values) < 0.5 * graph.size() * 3
+    with pytest.raises(ConfigError, match="landmark_kalman keeps no whole graph; use batch, isam2"):
+        live.graph()
+
+
+@pytest.mark.parametrize("kind", ["ekf", "isam2"])
+def test_a_session_takes_what_other_sensors_measure(folder: Path, kind: str) -> None:
+    """A beacon, and in the last frame a position that is 0.3 m off what all else says."""
+    recording = fg.open_recording(folder)
+    bTc = recording.rig.bTc
+    beacon, gps, number = fg.RangeBearing(), fg.Position(bTc), fg.Measured.FIRST_ID + 7
+    with fg.Slam(recording.rig, kind) as slam:
+        for k, (t, images, odometry) in enumerate(recording):
+            seen = [
+                beacon.measured([[4.0, 0.1, 0.0]], 0.01 * np.eye(3), [fg.Measured.FIRST_ID + 7])
+            ]
+            if k == FRAMES - 1:
+                there = slam.path.poses[-1][:3, 3] + [0.3, 0.0, 0.0]
+                seen.append(gps.measured(there, 1e-8 * np.eye(3)))
+            slam.track(t, images, odometry, seen)
+        with pytest.raises(MeasurementLogError, match=r"add fgslam\.Measured\.FIRST_ID"):
+            slam.track(t + 1.0, images, None, [beacon.measured([[4.0, 0, 0]], np.eye(3), [7])])
+        with pytest.raises(MeasurementLogError, match=r"a float; give what model\.measured"):
+            slam.track(t + 1.0, images, None, [as_any(4.0)])
+    live = slam.result()
+    np.testing.assert_allclose(live.trajectory.poses[-1][:3, 3], there, rtol=0, atol=0.02)
+    assert live.estimate.landmarks.ids[-1] == number
+    assert live.map.ids.max() < fg.Measured.FIRST_ID
+    replayed = fg.replay(slam.log, kind)
+    np.testing.assert_array_equal(replayed.trajectory.poses, live.trajectory.poses)
+    if kind == "isam2":
+        assert number in live.graph().landmarks
+
+
+def test_overrides_come_second_wherever_they_are_taken() -> None:
+    for function in (fg.run, fg.open_recording, fg.Slam.from_config):
+        assert list(inspect.signature(function).parameters)[1] == "overrides"
 
 
 def test_live_and_replayed_results_stand_in_one_table(
@@ -245,9 +291,9 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
     return {
         "experiment": (ConfigError, "comes with fgslam", lambda _: fg.run("lab_lop")),
         "file": (ConfigError, "no such file", lambda _: fg.run("nowhere/x.yaml")),
-        "key": (ConfigError, "unknown key sed", lambda p: fg.run("lab_loop", p, {"sed": 1})),
-        "one text": (ConfigError, "is one value", lambda p: fg.run("lab_loop", p, "seed=1")),
-        "array": (ConfigError, "seed is a ndarray", lambda p: fg.run("x", p, {"seed": np.ones(2)})),
+        "key": (ConfigError, "unknown key sed", lambda p: fg.run("lab_loop", {"sed": 1}, p)),
+        "one text": (ConfigError, "is one value", lambda p: fg.run("lab_loop", "seed=1", p)),
+        "array": (ConfigError, "seed is a ndarray", lambda p: fg.run("x", {"seed": np.ones(2)}, p)),
         "folder": (DatasetError, "is empty; give the folder", lambda p: fg.open_recording(p)),
         "no folder": (DatasetError, "no such folder", lambda p: fg.open_recording(p / "x")),
         "session": (ConfigError, "comes with fgslam", lambda _: fg.Slam.from_config("kiti06")),
@@ -261,11 +307,11 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "truth": (ConfigError, "Trajectory.load", lambda _: fg.compare({}, as_any("truth.tum"))),
         "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
         "no path": (DatasetError, "recording: the name is empty", lambda _: fg.open_recording("")),
-        "None": (DatasetError, "experiment: a NoneType", lambda p: fg.run(as_any(None), p)),
+        "None": (DatasetError, "experiment: a NoneType", lambda p: fg.run(as_any(None), out=p)),
         "existing": (
             ConfigError,
             "use one of refuse, overwrite, resume",
-            lambda p: fg.run("lab_loop", p, existing=as_any("replace")),
+            lambda p: fg.run("lab_loop", out=p, existing=as_any("replace")),
         ),
         "no workers": (
             ConfigError,
@@ -276,7 +322,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "name of no kind": (
             ConfigError,
             "estimator = 'ekf2' is not usable: give a group of keys, .*; kinds: odometry, ",
-            lambda p: fg.run("lab_loop", p, {"estimator": "ekf2"}),
+            lambda p: fg.run("lab_loop", {"estimator": "ekf2"}, p),
         ),
         "no flag": (
             ConfigError,
