@@ -25,74 +25,76 @@ TYPE_CHECKING = False  # as in typing, whose import takes as long as all else he
 if TYPE_CHECKING:
     from typing import Any
 
-    from fgslam.backend.protocol import Estimator
-    from fgslam.cameras.omni_files import load_camera
-    from fgslam.cameras.rig import StereoRig, load_rig
-    from fgslam.core.bearings import Refusal, TwoViewVector
-    from fgslam.core.log import MeasurementLog
-    from fgslam.core.sensors import Increment, Measured, Odometry
-    from fgslam.core.types import Features, Trajectory
-    from fgslam.evaluation.judging import compare
-    from fgslam.factors.measurement import LandmarkModel, PoseModel
-    from fgslam.factors.models import Position, Range, RangeBearing
-    from fgslam.homing.api import HomingVector, PathFollower, teach
-    from fgslam.homing.route import PathMemory
-    from fgslam.homing.steering import DriveCommand
-    from fgslam.homing.topological_map import RouteMap
-    from fgslam.report.figures import plot
-    from fgslam.runs.judge import judge
-    from fgslam.runs.library import graph, open_recording, rendered_recording, replay, run, sweep
-    from fgslam.runs.session import Map, Result, Slam
-    from fgslam.slam.feature_stream import FeatureExtractor
-    from fgslam.slam.motion import MotionModel
-    from fgslam.slam.results import Step
-    from fgslam.slam.rig_memory import RigMemory
-    from fgslam.slam.session import NewestFrame
-
-__all__ = [
-    "DriveCommand",
-    "Estimator",
-    "FeatureExtractor",
-    "Features",
-    "HomingVector",
-    "Increment",
-    "LandmarkModel",
-    "Map",
-    "Measured",
-    "MeasurementLog",
-    "MotionModel",
-    "NewestFrame",
-    "Odometry",
-    "PathFollower",
-    "PathMemory",
-    "PoseModel",
-    "Position",
-    "Range",
-    "RangeBearing",
-    "Refusal",
-    "Result",
-    "RigMemory",
-    "RouteMap",
-    "Slam",
-    "Step",
-    "StereoRig",
-    "Trajectory",
-    "TwoViewVector",
-    "__version__",
-    "compare",
-    "errors",
-    "graph",
-    "judge",
-    "load_camera",
-    "load_rig",
-    "open_recording",
-    "plot",
-    "rendered_recording",
-    "replay",
-    "run",
-    "sweep",
-    "teach",
-]
+    from fgslam.backend.protocol import Estimator as Estimator
+    from fgslam.cameras.omni_files import load_camera as load_camera
+    from fgslam.cameras.rig import StereoRig as StereoRig
+    from fgslam.cameras.rig import load_rig as load_rig
+    from fgslam.core.bearings import Refusal as Refusal
+    from fgslam.core.bearings import TwoViewVector as TwoViewVector
+    from fgslam.core.log import MeasurementLog as MeasurementLog
+    from fgslam.core.sensors import (
+        Increment as Increment,
+    )
+    from fgslam.core.sensors import (
+        Measured as Measured,
+    )
+    from fgslam.core.sensors import (
+        Odometry as Odometry,
+    )
+    from fgslam.core.types import Features as Features
+    from fgslam.core.types import Trajectory as Trajectory
+    from fgslam.evaluation.judging import compare as compare
+    from fgslam.factors.measurement import LandmarkModel as LandmarkModel
+    from fgslam.factors.measurement import PoseModel as PoseModel
+    from fgslam.factors.models import (
+        Position as Position,
+    )
+    from fgslam.factors.models import (
+        Range as Range,
+    )
+    from fgslam.factors.models import (
+        RangeBearing as RangeBearing,
+    )
+    from fgslam.homing.api import (
+        HomingVector as HomingVector,
+    )
+    from fgslam.homing.api import (
+        PathFollower as PathFollower,
+    )
+    from fgslam.homing.api import (
+        teach as teach,
+    )
+    from fgslam.homing.route import PathMemory as PathMemory
+    from fgslam.homing.steering import DriveCommand as DriveCommand
+    from fgslam.homing.topological_map import RouteMap as RouteMap
+    from fgslam.report.figures import plot as plot
+    from fgslam.runs.judge import judge as judge
+    from fgslam.runs.library import (
+        graph as graph,
+    )
+    from fgslam.runs.library import (
+        open_recording as open_recording,
+    )
+    from fgslam.runs.library import (
+        rendered_recording as rendered_recording,
+    )
+    from fgslam.runs.library import (
+        replay as replay,
+    )
+    from fgslam.runs.library import (
+        run as run,
+    )
+    from fgslam.runs.library import (
+        sweep as sweep,
+    )
+    from fgslam.runs.session import Map as Map
+    from fgslam.runs.session import Result as Result
+    from fgslam.runs.session import Slam as Slam
+    from fgslam.slam.feature_stream import FeatureExtractor as FeatureExtractor
+    from fgslam.slam.motion import MotionModel as MotionModel
+    from fgslam.slam.results import Step as Step
+    from fgslam.slam.rig_memory import RigMemory as RigMemory
+    from fgslam.slam.session import NewestFrame as NewestFrame
 
 _HOMES = {
     "DriveCommand": "fgslam.homing.steering",
@@ -137,6 +139,7 @@ _HOMES = {
     "teach": "fgslam.homing.api",
 }
 """Module that each public name is imported from, on first use (PEP 562)."""
+__all__ = ["__version__", "errors", *_HOMES]
 
 # Errors belong to core, where everything may raise them; users know them by this shorter name.
 sys.modules[f"{__name__}.errors"] = errors
