@@ -418,7 +418,7 @@ def test_step_and_covariances_are_those_of_the_whole_system(landmarks_first: boo
     system = whole.graph.linear(state)
     border, columns = system.border, system.columns
     assert border is not None
-    coupling = np.concatenate([np.zeros((columns, border.own.shape[0])), border.by_pose])
+    coupling = border.coupling
     every = np.r_[:columns, -len(border.by_pose) : 0]  # without what makes a last pair
     information = system.in_pairs.toarray()[np.ix_(every, every)]
     dense = np.block([[information, coupling], [coupling.T, border.own]])
