@@ -101,7 +101,8 @@ def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
     from scipy.io import loadmat
 
     file = loadmat(_data(f"{name.capitalize()}_.mat"))
-    steps, ranges, (seconds, *course) = file["DR"], file["TD"], file["GT"].T
+    steps, (seconds, *course) = file["DR"], file["GT"].T
+    ranges = file["TD"][np.unique(file["TD"][:, 0], return_index=True)[1]]  # some are out of order
     course[2] = np.unwrap(course[2]) + _HEADING[name]
     at = np.column_stack([np.interp(ranges[:, 0], seconds, one) for one in course])
     log, ends = MeasurementLog(), np.searchsorted(steps[:, 0], ranges[:, 0], "right")

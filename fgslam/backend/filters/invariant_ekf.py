@@ -45,7 +45,8 @@ class InvariantEkf(FullEkf):
         moved = wTc @ se3_exp(step[:FRONT])
         if self._floor.rigid_dof < 6:
             moved = self._floor.constrain(moved)
-        return moved, positions + step[FRONT:].reshape(-1, 3) @ turned.T
+        by, fixed = step[FRONT:].reshape(-1, 3), self._ids < 0  # nuisance parameters do not turn
+        return moved, positions + np.where(fixed[:, None], by, by @ turned.T)
 
     def _carry_errors(self, wTc: FloatArray, moved: FloatArray, positions: FloatArray) -> None:
         """The covariance in the errors of the state moved to."""
@@ -79,4 +80,5 @@ class InvariantEkf(FullEkf):
         if self._floor.rigid_dof < 6:
             basis = self._floor.basis(moved)
             of_pose = basis @ (basis.T @ of_pose)
-        return of_pose, skew(points - positions) @ wTc[:3, :3]
+        apart = np.where((self._ids < 0)[:, None], 0.0, points - positions)
+        return of_pose, skew(apart) @ wTc[:3, :3]
