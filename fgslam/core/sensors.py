@@ -303,6 +303,7 @@ class CameraRig(Brief):
     places: RigPlaces = field(default="all", repr=False)
     stated: bool = field(default=False, repr=False)
     angles = ()  # none of the three is one
+    nuisance = ()  # its terms are considered, or found by self-calibration
 
     @property
     def matrix(self) -> FloatArray:

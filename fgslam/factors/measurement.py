@@ -248,7 +248,9 @@ def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
 
 def shifted(model: Any, z: FloatArray) -> FloatArray:
     """(k, m, 3) shifts by up to 3 nuisance parameters; (k, m, 0) of a model without any."""
-    more = (3 - len(model.nuisance)) % 3
+    if not len(model.nuisance):
+        return np.zeros((*z.shape, 0))
+    more = 3 - len(model.nuisance)
     return np.asarray(np.pad(model.shifts(z), ((0, 0), (0, 0), (0, more))))
 
 

@@ -419,7 +419,7 @@ def test_step_and_covariances_are_those_of_the_whole_system(landmarks_first: boo
     border, columns = system.border, system.columns
     assert border is not None
     coupling = border.coupling
-    every = np.r_[:columns, -len(border.by_pose) : 0]  # without what makes a last pair
+    every = np.r_[:columns, columns - len(coupling) : 0]  # without what makes a last pair
     information = system.in_pairs.toarray()[np.ix_(every, every)]
     dense = np.block([[information, coupling], [coupling.T, border.own]])
     size = 1.0 / np.sqrt(np.diagonal(dense))
