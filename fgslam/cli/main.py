@@ -534,7 +534,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
         max_range (--range METRES): farthest depth; default by the cameras' precision
         cameras: 2 leaves the top camera out
         every: of the frames every so many are matched densely
-        sigma (METRES): what is known less well is left out of --dense and --mesh; default 1.5
+        sigma (METRES): what is known less well is left out of --dense and --mesh; default 2.25
             voxels
         recording: where the run's recording is now; default where it was, or next to the run
         overwrite: replace an earlier one

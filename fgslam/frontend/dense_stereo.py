@@ -26,11 +26,11 @@ MIN_DISPARITY_PX = 4.0
 _STEPS = 16  # of a pixel, in OpenCV's disparities
 _BLOCK = 7
 _AGREE_PX = 1.0  # of the second pass, and of two pairs
-_WINDOW = (9, 9)
-_PIXELS = 81
+_WINDOW = (7, 7)
+_PIXELS = 49
 _STEPS_OF_NEWTON = 2
 _FARTHEST_PX = 0.5  # of one step: as far as a gradient holds
-_SMOOTH = (9, 1.0, 3.0)  # reach, alike in disparity, distance: pixels
+_ALIKE_PX = 0.1  # of one surface are disparities that deviate less
 _MATCHER_SIGMA_PX = 0.2  # of the matcher's disparities, steps equalised, in the rendered lab
 _ALONG = np.eye(2, dtype=np.float32)  # in which the left and the top image are displaced
 _HALF = np.float32(0.5)
@@ -63,20 +63,26 @@ class DenseStereo:
         if correction is not None and np.any(correction):
             self._maps = [_sampling(rig, k, correction) for k in range(len(self._ratios) + 1)]
 
-    def learn_steps(self, frames: Iterable[Sequence[Image]]) -> None:
-        """Finds what each sixteenth of a pixel stands for, from images (right, left[, top]).
+    def learn_steps(self, frames: Iterable[Sequence[Image]]) -> Float32:
+        """Finds what each sixteenth of a pixel stands for; the disparities (n,) found, pixels.
 
         True fractions are equally likely, the matcher's are not: it prefers whole pixels, and
         rounds up below them. By its symmetry the border of steps 8 and 9 is a half.
+
+        Args:
+            frames: images (right, left[, top]) of each.
         """
-        counts = np.ones(_STEPS)
+        counts, seen = np.ones(_STEPS), [np.empty(0, np.float32)]
         for images in frames:
-            for raw in self._match(self._grey(images)):
+            for raw, ratio in zip(self._match(self._grey(images)), self._ratios, strict=True):
                 counts += np.bincount(raw[raw > 0] % _STEPS, minlength=_STEPS)
+                seen.append((raw[raw > 0] / (_STEPS * ratio)).astype(np.float32))
         shares = np.roll(counts, -(_STEPS // 2 + 1)) / counts.sum()
         middles = np.cumsum(shares) - 0.5 * shares + 0.5
         found = np.roll(middles, _STEPS // 2 + 1)
         self.steps = np.where(np.arange(_STEPS) <= _STEPS // 2, found - 1.0, found)
+        found = np.concatenate(seen)
+        return found[found >= MIN_DISPARITY_PX]
 
     def measure(self, images: Sequence[Image]) -> tuple[Float32, Float32]:
         """Disparities (height, width) and their deviations, pixels; 0 where there is none.
@@ -143,7 +149,11 @@ class DenseStereo:
             return np.asarray(cv2.blur(weight * values, _WINDOW) / count)
 
         def smooth(values: Float32) -> Float32:
-            return np.where(known, cv2.bilateralFilter(values, *_SMOOTH), np.float32(0.0))
+            middle = mean(values)  # guided by themselves (He, Sun and Tang 2010)
+            varying = np.maximum(mean(values * values) - middle * middle, np.float32(0.0))
+            kept = np.asarray(varying / (varying + np.float32(_ALIKE_PX**2)), np.float32)
+            smoothed = mean(kept) * values + mean(middle - kept * middle)
+            return np.where(known, smoothed, np.float32(0.0))
 
         start = d = smooth(disparity)
         for _ in range(_STEPS_OF_NEWTON):

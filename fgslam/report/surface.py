@@ -31,7 +31,8 @@ from fgslam.report.formats import (
 )
 
 TRUNCATION_VOXELS = 4.0
-KEPT_SIGMA_VOXELS = 1.5
+KEPT_SIGMA_VOXELS = 2.25
+_ALIKE = 0.07  # correlation of the errors of two frames, in the rendered lab
 _SIDE = 8  # voxels of a block
 _OFFSETS = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij"), -1)[..., ::-1]
 _OFFSETS = _OFFSETS.reshape(-1, 3).astype(np.float32)  # x runs fastest, as in Open3D's blocks
@@ -72,10 +73,9 @@ class Fusion:
             tuple((n,) for n in _ATTRIBUTES.values()),
             voxel_m,
             _SIDE,
-            1000,
+            4000,
             o3c.Device("CPU:0"),
         )
-        self._blocks = np.empty((0, 3), np.int32)
 
     def add(self, frame: DepthFrame) -> None:
         """Integrates one depth image; one without any depth changes nothing."""
@@ -91,10 +91,11 @@ class Fusion:
             TRUNCATION_VOXELS,
         ).numpy()
         self._grid.hashmap().activate(tensor(seen))
-        carved = self._blocks[self._before(frame, cTw)]
-        self._blocks = np.unique(np.concatenate([self._blocks, seen]), axis=0)
-        blocks = np.unique(np.concatenate([carved, seen]), axis=0)
-        rows = self._rows(blocks)
+        known = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
+        keys = self._grid.hashmap().key_tensor().numpy()
+        carved = known[self._before(keys[known], frame, cTw)]
+        rows = np.union1d(carved, self._rows(seen))
+        blocks = keys[rows]
         # In the camera's frame: a block's corner and its voxels' offsets.
         rotation = cTw[:3, :3].astype(np.float32) * np.float32(self.voxel_m)
         corners = blocks @ (_SIDE * rotation.T) + cTw[:3, 3].astype(np.float32)
@@ -149,10 +150,10 @@ class Fusion:
         inside = (z > 0.0) & (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
         return np.where(inside, v * np.float32(shape[1]) + u, np.float32(-1.0)).astype(np.int32)
 
-    def _before(self, frame: DepthFrame, cTw: FloatArray) -> BoolArray:
-        """(n,) blocks that the frame sees through."""
+    def _before(self, blocks: IntArray, frame: DepthFrame, cTw: FloatArray) -> BoolArray:
+        """Whether the frame sees through each of blocks (n, 3)."""
         side = _SIDE * self.voxel_m
-        middles = (self._blocks + 0.5) * side @ cTw[:3, :3].T + cTw[:3, 3]
+        middles = (blocks + 0.5) * side @ cTw[:3, :3].T + cTw[:3, 3]
         x, y, z = middles.T.astype(np.float32)
         pixel = self._pixels(x, y, z, frame.depth.shape)
         depth = np.where(pixel >= 0, frame.depth.ravel()[pixel], 0.0)
@@ -161,9 +162,10 @@ class Fusion:
     def surface(self, kept_sigma_m: float) -> Surface:
         """The surface where its deviation along the rays is at most so much."""
         weight, count = self._array("weight"), self._array("count")
-        # Images that contradict each other more than they should know less than they state.
+        # Images that contradict each other more than they should know less than they state, and
+        # what they have in common no mean takes away.
         spread = self._array("scatter") * self._truncation**2 / np.maximum(count - 1.0, 1.0)
-        weight /= np.maximum(spread, 1.0)
+        weight /= np.maximum(spread, 1.0) * (1.0 + _ALIKE * np.maximum(count - 1.0, 0.0))
         if not (weight >= kept_sigma_m**-2).any():
             return Surface.empty()
         mesh = self._grid.extract_triangle_mesh(kept_sigma_m**-2)

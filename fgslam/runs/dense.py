@@ -42,7 +42,7 @@ _Read = TypeVar("_Read")
 
 _VOXEL_PX, _FINEST_PX = 3.0, 0.5  # of the image, at the median depth
 _TYPICAL_PX = 0.1  # deviation of a disparity, which bounds how far it is worth to look
-_SAMPLES = 12  # frames from which steps of disparity and the median depth are learnt
+_SAMPLES = 6  # frames from which steps of disparity and the median depth are learnt
 _LENGTH = SHARED.index("baseline")
 _LEVEL = np.cos(np.deg2rad(2.5))
 _CUT_VOXELS = 2.0 * TRUNCATION_VOXELS  # deviation of a depth beyond which it is not used
@@ -58,7 +58,7 @@ class DenseSettings:
             of a pixel is four voxels.
         cameras: 2 leaves the top camera out.
         every: of the frames that have a pose, every so many are used.
-        sigma_m: what is known less well to its neighbours is left out; None: 1.5 voxels.
+        sigma_m: what is known less well to its neighbours is left out; None: 2.25 voxels.
     """
 
     voxel_m: float | None = None
@@ -114,12 +114,12 @@ Measured: TypeAlias = Callable[[int], tuple[Depth, Float32, Image]]
 
 def _by_matching(
     log: MeasurementLog, pictures: Pictures, samples: Sequence[int], cameras: int | None
-) -> Measured:
-    """Depth by matching the images, whose steps are learnt from some frames."""
+) -> tuple[Measured, Depth]:
+    """Depth by matching the images, whose steps are learnt from some frames, with their depths."""
     corrections = [step.rig_correction for step in log if step.rig_correction is not None]
     matcher = DenseStereo(log.rig, cameras, corrections[-1] if corrections else None)
-    matcher.learn_steps(_readable(lambda row: matcher.corrected(pictures(row)), samples))
     product = np.float32(log.rig.fx * log.rig.baseline)
+    seen = matcher.learn_steps(_readable(lambda row: matcher.corrected(pictures(row)), samples))
 
     def measure(row: int) -> tuple[Depth, Float32, Image]:
         images = matcher.corrected(pictures(row))
@@ -128,7 +128,7 @@ def _by_matching(
         depth = np.where(known, product / np.where(known, disparity, np.float32(1.0)), 0.0)
         return depth.astype(np.float32), sigma / product, images[0]
 
-    return measure
+    return measure, product / seen
 
 
 def _by_camera(depths: Callable[[int], Depth], pictures: Pictures) -> Measured:
@@ -172,13 +172,13 @@ def fuse(
     some = np.unique(np.linspace(0, len(used) - 1, _SAMPLES).astype(int))
     samples = [rows[used[k]] for k in some]
     if depths is None:
-        measured = _by_matching(log, pictures, samples, settings.cameras)
+        measured, seen = _by_matching(log, pictures, samples, settings.cameras)
         farthest = rig.fx * rig.baseline / MIN_DISPARITY_PX
         noise = _TYPICAL_PX / (rig.fx * rig.baseline)
     else:
         measured, farthest, noise = _by_camera(depths, pictures), np.inf, DEPTH_SIGMA_M
-    found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples[::3])]
-    seen = np.concatenate([np.empty(0, np.float32), *found])
+        found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples)]
+        seen = np.concatenate([np.empty(0, np.float32), *found])
     if not len(seen):
         raise DatasetError(
             "the images of this recording show no depth: no pair agrees anywhere; check the "

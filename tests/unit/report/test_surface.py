@@ -67,10 +67,10 @@ def test_a_surface_lies_where_the_depths_say_with_its_normals_colours_and_deviat
     below = surface.normals[:, 1] < -0.9
     assert np.abs(surface.positions[below, 1] - FLOOR_M).max() < 0.02  # next to the wall
     assert np.abs(surface.colours.astype(int) - [200, 100, 50]).max() <= 1
-    # Four depths of the wall, each known to SIGMA times its square.
+    # Four depths of the wall, each known to SIGMA times its square, with 7 % of it in common.
     middle = ahead & (np.abs(surface.positions[:, 0] - 0.15) < 0.5)
-    expected = SIGMA * WALL_M**2 / 2.0
-    assert np.median(surface.voxel_sigmas[middle]) == pytest.approx(expected, rel=0.1)
+    expected = SIGMA * WALL_M**2 * np.sqrt((1.0 + 3 * 0.07) / 4.0)
+    assert np.median(surface.voxel_sigmas[middle]) == pytest.approx(expected, rel=0.05)
     np.testing.assert_allclose(surface.shared_sigmas, 0.02, rtol=0, atol=1e-5)
     assert (surface.sigmas >= surface.shared_sigmas).all()
     a, b, c = (surface.positions[surface.triangles[:, k]] for k in range(3))
