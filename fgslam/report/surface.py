@@ -32,7 +32,8 @@ from fgslam.report.formats import (
 
 TRUNCATION_VOXELS = 4.0
 KEPT_SIGMA_VOXELS = 2.25
-_ALIKE = 0.07  # correlation of the errors of two frames, in the rendered lab
+_GRAZING = np.float32(0.2)  # sine of the flattest angle at which the ground is known by its normal
+_ALIKE = 0.1  # correlation of the errors of two frames, in the rendered lab
 _SIDE = 8  # voxels of a block
 _OFFSETS = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij"), -1)[..., ::-1]
 _OFFSETS = _OFFSETS.reshape(-1, 3).astype(np.float32)  # x runs fastest, as in Open3D's blocks
@@ -107,7 +108,7 @@ class Fusion:
         use = np.flatnonzero(pixel >= 0)
         pixel, z = pixel[use], z[use]
         depth = frame.depth.ravel()[pixel]
-        apart = depth - z
+        apart = (depth - z) * self._grazing(frame.depth).ravel()[pixel]
         near = (depth > 0.0) & (apart >= -self._truncation)
         use, pixel, z, apart = use[near], pixel[near], z[near], apart[near]
         sigma = frame.sigma.ravel()[pixel] * z * z
@@ -120,6 +121,21 @@ class Fusion:
         shared[at] += share * (frame.shared.ravel()[pixel] - shared[at])
         shown = frame.image.reshape(frame.depth.size, -1)[pixel]
         colour[at] += share[:, None] * (shown - colour[at])
+
+    def _grazing(self, depth: Float32) -> Float32:
+        """Sine of the angle (height, width) at which each ray meets the ground.
+
+        Of the slope from row to row, the lesser of both sides: at an edge one of them is a step.
+        """
+        _, fy, cy = self._matrix[1].astype(np.float32)
+        near = np.where(depth > 0.0, 1.0 / np.maximum(depth, 1e-3), np.inf).astype(np.float32)
+        with np.errstate(invalid="ignore"):
+            steps = np.diff(near, axis=0, prepend=np.inf, append=np.inf)
+            slope = np.fmin(np.abs(steps[1:]), np.abs(steps[:-1]))
+            slope[~((steps[1:] > 0.0) & (steps[:-1] > 0.0) & np.isfinite(slope))] = 0.0
+            rows = np.arange(len(depth), dtype=np.float32)[:, None] - cy
+            sine = near / np.hypot(fy * slope, near - rows * slope)
+        return np.where(np.isfinite(sine), np.maximum(sine, _GRAZING), np.float32(1.0))
 
     def _take_in(self, at: IntArray, weight: Float32, tsdf: Float32) -> Float32:
         """Weighted means (West 1979) at voxels (n,), each once; the weights' shares in the sums."""

@@ -67,9 +67,9 @@ def test_a_surface_lies_where_the_depths_say_with_its_normals_colours_and_deviat
     below = surface.normals[:, 1] < -0.9
     assert np.abs(surface.positions[below, 1] - FLOOR_M).max() < 0.02  # next to the wall
     assert np.abs(surface.colours.astype(int) - [200, 100, 50]).max() <= 1
-    # Four depths of the wall, each known to SIGMA times its square, with 7 % of it in common.
+    # Four depths of the wall, each known to SIGMA times its square, with a tenth in common.
     middle = ahead & (np.abs(surface.positions[:, 0] - 0.15) < 0.5)
-    expected = SIGMA * WALL_M**2 * np.sqrt((1.0 + 3 * 0.07) / 4.0)
+    expected = SIGMA * WALL_M**2 * np.sqrt((1.0 + 3 * 0.1) / 4.0)
     assert np.median(surface.voxel_sigmas[middle]) == pytest.approx(expected, rel=0.05)
     np.testing.assert_allclose(surface.shared_sigmas, 0.02, rtol=0, atol=1e-5)
     assert (surface.sigmas >= surface.shared_sigmas).all()
@@ -78,6 +78,23 @@ def test_a_surface_lies_where_the_depths_say_with_its_normals_colours_and_deviat
         "ij,ij->i", np.cross(b - a, c - a), surface.normals[surface.triangles[:, 0]]
     )
     assert (outwards > 0.0).mean() > 0.95
+
+
+@pytest.mark.usefixtures("open3d")
+def test_a_road_that_rays_graze_has_no_holes() -> None:
+    frames = []
+    for way in 0.15 * np.arange(10):
+        start = np.array([0.0, 0.02 * way, way])
+        with np.errstate(divide="ignore"):
+            road = np.where(RAYS[..., 1] > 0.0, (FLOOR_M - start[1]) / RAYS[..., 1], 0.0)
+        road = np.where(road < 5.0, road, 0.0).astype(np.float32)
+        full, image = np.full(SHAPE, SIGMA, np.float32), np.full(SHAPE, 99, np.uint8)
+        wTc = pose(np.eye(3), start)
+        frames.append(DepthFrame(road, full, image, wTc, np.zeros(SHAPE, np.float32)))
+    seen = fused(frames).positions
+    ahead = seen[(np.abs(seen[:, 0]) < 0.5) & (seen[:, 2] > 2.0) & (seen[:, 2] < 4.0)]
+    cells = np.unique(np.floor(ahead[:, [0, 2]] / 0.1), axis=0)
+    assert len(cells) > 0.9 * 10 * 20
 
 
 @pytest.mark.usefixtures("open3d")
