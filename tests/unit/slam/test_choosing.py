@@ -49,7 +49,7 @@ def test_an_unusable_front_end_is_refused(given: Any) -> None:
 
 def test_a_rig_of_another_type_is_refused() -> None:
     rig: Any = {"fx": 500.0}
-    with pytest.raises(CalibrationError, match=r"it is a dict; give a fgslam\.StereoRig"):
+    with pytest.raises(CalibrationError, match=r"it is a dict; give fgslam\.StereoRig"):
         Session(rig)
 
 

@@ -522,7 +522,7 @@ def test_what_is_no_extractor_is_refused() -> None:
 
 def test_what_is_no_rig_is_refused() -> None:
     no_rig: Any = "camchain.yaml"
-    with pytest.raises(CalibrationError, match=r"it is a str; give a fgslam\.StereoRig"):
+    with pytest.raises(CalibrationError, match=r"it is a str; give fgslam\.StereoRig"):
         Session(no_rig)
 
 
