@@ -38,7 +38,7 @@ from fgslam.factors.measurement import (
 _FIT = GaussNewton(iterations=20, converged=1e-6, longest=20.0, damping=1e-6)
 _FROM_M = (2.0, 8.0, 32.0)  # distances from which a point is looked for
 _FROM = 16  # directions
-_LOOKED_FOR = (4, 6, 9, 13, 19, 28, 42, 60)
+LOOKED_FOR = (4, 6, 9, 13, 19, 28, 42, 60)
 """Numbers of measurements of a landmark at which it is looked for; after the last, half stay."""
 _KNOWN = 8.0  # range over deviation from which a point is normally distributed, as of cameras' ones
 _RIVAL = float(chi_square_quantile(0.999, 3))
@@ -198,9 +198,9 @@ class Waiting:
     def _found(self, identity: int, new: Single) -> tuple[FloatArray, FloatArray] | None:
         """The world point that a landmark's measurements fix, with one more; its covariance."""
         own = [*self._singles.get(identity, []), new]
-        self._singles[identity] = own if len(own) < _LOOKED_FOR[-1] else own[::2]
+        self._singles[identity] = own if len(own) < LOOKED_FOR[-1] else own[::2]
         known = all(single.kind in self._models for single in own)
-        return fixed_point(own, self._models) if len(own) in _LOOKED_FOR and known else None
+        return fixed_point(own, self._models) if len(own) in LOOKED_FOR and known else None
 
 
 _COLUMNS = ("wTs", "value", "noise")

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
-from fgslam.backend.settings import EstimatorSettings
-from fgslam.core.arrays import FloatArray
+from fgslam.backend.settings import EstimatorSettings, family_of
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, MeasurementType, Observations
@@ -252,6 +252,24 @@ def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
         raise ConfigError(f"it cannot use {' and '.join(lacking)} measurements")
 
 
+def never_placed(log: MeasurementLog, held: IntArray) -> str:
+    """Why nothing of a sensor was used: its landmarks, seen often, got no place among ``held``."""
+    seen: dict[str, list[IntArray]] = {}
+    for one in (one for increment in log for one in increment.measured if len(one.ids)):
+        seen.setdefault(one.kind, []).append(one.ids)
+    for kind, ids in seen.items():
+        from fgslam.backend.measured import LOOKED_FOR  # loads GTSAM
+
+        own, times = np.unique(np.concatenate(ids), return_counts=True)
+        if times.max() >= LOOKED_FOR[-1] and not np.isin(own, held).any():
+            return (
+                f"none of {times.sum():,} measurements of kind {kind!r} is used: they leave open "
+                "where in space their landmarks are; let predict() give what else is known, "
+                "e.g. their height, or start() where they begin"
+            )
+    return ""
+
+
 class _Replaying:
     """Collects the frames of a replay."""
 
@@ -299,6 +317,8 @@ class _Replaying:
             estimate, why = estimate_of_failed(estimator, online, covariances)
             estimate = bridged(estimate, self._parts)
             final_ms = math.nan if why else 1e3 * (time.perf_counter() - start)
+            if family_of(self._settings.kind) != "other":  # odometry alone takes none
+                why = why or never_placed(self._log, estimate.landmarks.ids)
             failure = "; ".join(filter(None, (failure, why)))
         else:
             estimate = Estimate(online, covariances, NO_LANDMARKS)

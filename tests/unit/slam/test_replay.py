@@ -12,11 +12,16 @@ from loops import CLOSED, Rounds, drive_rounds
 from simulated import RIG, Drive, assert_same_bits, play, simulate
 
 from fgslam.backend.filters.kalman import LandmarkKalman
+from fgslam.backend.measured import LOOKED_FOR
 from fgslam.backend.settings import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import pose
 from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.evaluation.judging import Truth, judge_replay
+from fgslam.factors.measurement import LandmarkModel
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam import build as factory
 from fgslam.slam import replay as module
@@ -195,3 +200,26 @@ def test_a_frame_that_the_estimator_names_itself_is_named_once() -> None:
     spoilt = MeasurementLog(RIG, log.motion_model, increments)
     replayed = replay(spoilt, BatchSettings(), EgoMotionSettings())
     assert replayed.failure.startswith(f"frame {increments[4].index}: the measurement or its")
+
+
+class Azimuth(LandmarkModel):
+    """Of a beacon, whose height no azimuth shows."""
+
+    kind, size, angles = "azimuth", 1, (0,)
+
+    def predict(self, x: FloatArray) -> FloatArray:
+        return np.asarray(np.arctan2(x[:, 1], x[:, 0])[:, None])
+
+
+def test_measurements_that_place_no_landmark_are_not_passed_over_in_silence() -> None:
+    log, model = MeasurementLog(), Azimuth()
+    for k in range(LOOKED_FOR[-1]):
+        seen = model.measured(np.array([[np.arctan2(3.0, 5.0 - 0.1 * k)]]), [[1e-4]], ids=[7])
+        odometry = Odometry(pose(np.eye(3), np.array([0.1, 0.0, 0.0])), 1e-4 * np.eye(6))
+        log.append(Increment.of(k, 0.1 * k, odometry if k else None, [seen]))
+    for settings in (SETTINGS, BatchSettings()):
+        assert (
+            "none of 60 measurements of kind 'azimuth' is used"
+            in replay(log, settings, EgoMotionSettings()).failure
+        )
+    assert not replay(log, DeadReckoningSettings(), EgoMotionSettings()).failure
