@@ -146,7 +146,7 @@ def draw_flow(
     _write(path, np.concatenate([panel, below]))
 
 
-_VIEW_PX, _VIEW_QUALITY = 320, 60
+_VIEW_PX, _VIEW_QUALITY = 240, 55
 
 
 def draw_view(path: Path, image: Image) -> None:
