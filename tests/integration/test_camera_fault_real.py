@@ -57,4 +57,4 @@ def test_the_end_of_a_drive_with_a_late_camera_is_as_uncertain_as_it_is_wrong(
     assert counts["one_image"] + counts["camera_fault"] >= FRAMES - LATE_FROM - 1
     assert own["predicted_frames"] == counts["camera_fault"]
     assert any("the left camera" in note for note in result.notes)
-    assert not result.located.enough
+    assert result.located.frames == FRAMES - counts["camera_fault"]
