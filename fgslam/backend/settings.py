@@ -11,6 +11,13 @@ from pydantic.dataclasses import dataclass
 from fgslam.core.settings import STRICT, Count, Index, NonNegative, Positive
 
 FloorMode: TypeAlias = Literal["auto", "none", "soft", "hard"]
+OnFloor: TypeAlias = Annotated[
+    FloorMode,
+    Field(
+        description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
+        "exact; `soft` up to 5 mm and 0.2 degrees a frame"
+    ),
+]
 Family: TypeAlias = Literal["filter", "smoother", "other"]
 """Whether past poses are revised; paired tests compare smoothers with filters, and no others.
 
@@ -91,11 +98,7 @@ class JointFilterSettings(NamedSettings):
     """What filters with one joint covariance of pose and landmarks share."""
 
     family: ClassVar[Family] = "filter"
-    floor: FloorMode = Field(
-        default="auto",
-        description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
-        "exact; `soft` up to 5 mm and 0.2 degrees a frame",
-    )
+    floor: OnFloor = "auto"
     gate_sigmas: NonNegative = Field(
         default=5.0, description="gate on a match's innovation, standard deviations; 0: none"
     )
@@ -127,7 +130,7 @@ class FastSlamSettings(NamedSettings):
     kind: Literal["fast_slam"] = "fast_slam"
     particles: Count = Field(default=30, description="paths; time and memory are in proportion")
     seed: Index = Field(default=0, description="of the draws; not the run's seed")
-    floor: FloorMode = Field(default="auto", description="as of `ekf`")
+    floor: OnFloor = "auto"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -135,11 +138,7 @@ class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
     family: ClassVar[Family] = "smoother"
-    floor: FloorMode = Field(
-        default="auto",
-        description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
-        "exact; `soft` up to 5 mm and 0.2 degrees a frame",
-    )
+    floor: OnFloor = "auto"
     kernel: KernelSettings = KernelSettings()
     noise_factor: Positive | None = Field(
         default=None,

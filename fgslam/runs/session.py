@@ -569,8 +569,9 @@ class Slam(Session):
         found = super().result()
         seen = found.estimate.landmarks.below(Measured.FIRST_ID)
         points = map_points(seen, self.pipeline.tracker.database)
-        for row, identity in enumerate(points.ids.tolist()):
-            points.colours[row] = self._colours.get(identity, points.colours[row])
+        if self._colours:
+            for row, identity in enumerate(points.ids.tolist()):
+                points.colours[row] = self._colours.get(identity, points.colours[row])
         drive = {"remark": self._remark, "remarks": list(map(sentence, found.remarks))}
         estimate = replace(found.estimate, landmarks=seen)
         saved = map_of(self, estimate, self._before, name="session", **drive)

@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast, get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -150,7 +150,19 @@ def make_estimator(
     return _MAKERS[settings.kind](rig, settings, prior, ego_motion)
 
 
-_MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], Estimator]] = {
+_Maker: TypeAlias = Callable[[CameraRig, Any, Prediction, EgoMotionSettings], Estimator]
+
+
+def _on_floor(load: Callable[[], Any]) -> _Maker:
+    """What makes an estimator that keeps to a floor; its module is loaded when it is wanted."""
+
+    def make(rig: CameraRig, own: Any, prior: Prediction, ego: EgoMotionSettings) -> Estimator:
+        return cast("Estimator", load()(rig, own, make_floor(rig, own.floor, ego.dof), prior))
+
+    return make
+
+
+_MAKERS: Mapping[str, _Maker] = {
     "odometry": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.filters.dead_reckoning"
     ).DeadReckoning(rig, prior),
@@ -160,24 +172,18 @@ _MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], 
     "landmark_kalman_graph": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.filters.kalman_graph"
     ).LandmarkKalmanGraph(rig, own, prior, ego),
-    "ekf": lambda rig, own, prior, ego: import_module("fgslam.backend.filters.ekf").FullEkf(
-        rig, own, make_floor(rig, own.floor, ego.dof), prior
+    "ekf": _on_floor(lambda: import_module("fgslam.backend.filters.ekf").FullEkf),
+    "invariant_ekf": _on_floor(
+        lambda: import_module("fgslam.backend.filters.invariant_ekf").InvariantEkf
     ),
-    "invariant_ekf": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.filters.invariant_ekf"
-    ).InvariantEkf(rig, own, make_floor(rig, own.floor, ego.dof), prior),
-    "fast_slam": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.filters.fast_slam"
-    ).FastSlam(rig, own, make_floor(rig, own.floor, ego.dof), prior),
-    "fixed_lag": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.smoothers.lag"
-    ).fixed_lag_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
-    "isam2": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.smoothers.isam2"
-    ).isam2_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
-    "sliding_window": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.smoothers.lag"
-    ).sliding_window_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    "fast_slam": _on_floor(lambda: import_module("fgslam.backend.filters.fast_slam").FastSlam),
+    "fixed_lag": _on_floor(
+        lambda: import_module("fgslam.backend.smoothers.lag").fixed_lag_smoother
+    ),
+    "isam2": _on_floor(lambda: import_module("fgslam.backend.smoothers.isam2").isam2_smoother),
+    "sliding_window": _on_floor(
+        lambda: import_module("fgslam.backend.smoothers.lag").sliding_window_smoother
+    ),
     "batch": lambda rig, own, prior, ego: import_module(
         "fgslam.backend.smoothers.batch"
     ).batch_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior, ego),

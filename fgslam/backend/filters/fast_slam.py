@@ -32,6 +32,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     congruence,
+    inverse,
     inverse_spd3,
     moved_apart,
     reorthonormalise,
@@ -244,8 +245,7 @@ class FastSlam:
     def _mixture(self, poses: FloatArray, covariances: FloatArray) -> Prediction:
         """Mean and covariance of weighed normal distributions (n, 4, 4), (n, 6, 6)."""
         centre = poses[int(np.argmax(self._weights))]
-        cTw = np.linalg.inv(centre)
-        off = np.array([se3_log(cTw @ wTc) for wTc in poses])
+        off = np.array([se3_log(inverse(centre) @ wTc) for wTc in poses])
         mean = self._weights @ off
         spread = np.einsum("n,ni,nj->ij", self._weights, off - mean, off - mean)
         wTc = self._retracted(centre[None], mean[None])[0]

@@ -60,6 +60,7 @@ from fgslam.runs.tasks.slam_map_entry import (
 from fgslam.runs.tasks.slam_results import (
     RunOutputs,
     draw_frame,
+    frames_to_show,
     run_notes,
     stereo_precision,
     summary_table,
@@ -167,6 +168,7 @@ def _loop(
     """
     sequence, recorder, session = outputs.sequence, outputs.recorder, outputs.session
     output, frontend = outputs.config.output, outputs.config.frontend
+    shown = frames_to_show(len(sequence)) if output.pictures else frozenset()
     stream = make_stream(sequence, frontend, frontend.tracking == "sift")(start=len(recorder))
     waiting = time.perf_counter()
     interval, saved = output.checkpoint_seconds, waiting
@@ -186,7 +188,7 @@ def _loop(
                 wait_ms,
                 lambda report: stereo_precision(sequence, report.found.i, report.stereo),
             )
-            if output.pictures:
+            if found.i in shown:
                 draw_frame(outputs, found.i, report)
             if watch is not None:
                 watch(outputs, report)

@@ -729,21 +729,25 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
 _VIEWS = 24
 
 
+def frames_to_show(count: int) -> frozenset[int]:
+    """Which of ``count`` frames are drawn: the first, the middle, and those of the views."""
+    return frozenset({0, count // 2, *thinned(count, _VIEWS).tolist()})
+
+
 def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
-    """Pictures of the sequence's frame ``i``, where it is one of those that are drawn.
+    """Pictures of the sequence's frame ``i``, one of those that are drawn.
 
     Views of frames evenly spread; features (Fig. 1) of the first; disparities (Fig. 2) and flow
     (Fig. 3) of the middle one.
     """
-    count = len(outputs.sequence)
-    view, drawn = i in thinned(count, _VIEWS), i in (0, count // 2)
-    if report.found.frame is None or not (view or drawn):
+    if report.found.frame is None:
         return
+    count = len(outputs.sequence)
     folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
-    if view:
+    if i in thinned(count, _VIEWS):
         draw_view(folder / f"{VIEW}_{len(outputs.recorder) - 1:06d}.jpg", images[0])
-    if not drawn:
+    if i not in (0, count // 2):
         return
     predicted = predicted_poses(outputs.recorder.column("status").tolist())  # so far
     what = f"{outputs.config.name}: frame {report.increment.index}"
