@@ -27,41 +27,25 @@ if TYPE_CHECKING:
 
     from fgslam.backend.protocol import Estimator as Estimator
     from fgslam.cameras.omni_files import load_camera as load_camera
-    from fgslam.cameras.rig import StereoRig as StereoRig
-    from fgslam.cameras.rig import load_rig as load_rig
-    from fgslam.core.bearings import Refusal as Refusal
-    from fgslam.core.bearings import TwoViewVector as TwoViewVector
+    from fgslam.cameras.rig import StereoRig as StereoRig, load_rig as load_rig
+    from fgslam.core.bearings import Refusal as Refusal, TwoViewVector as TwoViewVector
     from fgslam.core.log import MeasurementLog as MeasurementLog
     from fgslam.core.sensors import (
         Increment as Increment,
-    )
-    from fgslam.core.sensors import (
         Measured as Measured,
-    )
-    from fgslam.core.sensors import (
         Odometry as Odometry,
     )
-    from fgslam.core.types import Features as Features
-    from fgslam.core.types import Trajectory as Trajectory
+    from fgslam.core.types import Features as Features, Trajectory as Trajectory
     from fgslam.evaluation.judging import compare as compare
-    from fgslam.factors.measurement import LandmarkModel as LandmarkModel
-    from fgslam.factors.measurement import PoseModel as PoseModel
+    from fgslam.factors.measurement import LandmarkModel as LandmarkModel, PoseModel as PoseModel
     from fgslam.factors.models import (
         Position as Position,
-    )
-    from fgslam.factors.models import (
         Range as Range,
-    )
-    from fgslam.factors.models import (
         RangeBearing as RangeBearing,
     )
     from fgslam.homing.api import (
         HomingVector as HomingVector,
-    )
-    from fgslam.homing.api import (
         PathFollower as PathFollower,
-    )
-    from fgslam.homing.api import (
         teach as teach,
     )
     from fgslam.homing.route import PathMemory as PathMemory
@@ -71,25 +55,13 @@ if TYPE_CHECKING:
     from fgslam.runs.judge import judge as judge
     from fgslam.runs.library import (
         graph as graph,
-    )
-    from fgslam.runs.library import (
         open_recording as open_recording,
-    )
-    from fgslam.runs.library import (
         rendered_recording as rendered_recording,
-    )
-    from fgslam.runs.library import (
         replay as replay,
-    )
-    from fgslam.runs.library import (
         run as run,
-    )
-    from fgslam.runs.library import (
         sweep as sweep,
     )
-    from fgslam.runs.session import Map as Map
-    from fgslam.runs.session import Result as Result
-    from fgslam.runs.session import Slam as Slam
+    from fgslam.runs.session import Map as Map, Result as Result, Slam as Slam
     from fgslam.slam.feature_stream import FeatureExtractor as FeatureExtractor
     from fgslam.slam.motion import MotionModel as MotionModel
     from fgslam.slam.results import Step as Step

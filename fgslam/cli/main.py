@@ -389,8 +389,7 @@ def judge(
     """
     from fgslam.cli.console import show_parts
     from fgslam.core.files import require_output
-    from fgslam.runs.judge import judge as judged
-    from fgslam.runs.judge import write_judged
+    from fgslam.runs.judge import judge as judged, write_judged
 
     if out is not None:
         files = [truth, covariance, *estimates]
@@ -475,8 +474,7 @@ def localize(
         overwrite: replace an earlier one
         chosen: which frames, and how they are read
     """
-    from fgslam.runs.tasks.localisation import Wanted
-    from fgslam.runs.tasks.localisation import localize as locate
+    from fgslam.runs.tasks.localisation import Wanted, localize as locate
 
     overrides, existing = tuple(chosen.as_overrides()), existing_folder(overwrite)
     wanted = Wanted(map_file, recording, overrides, frame, frames, out, existing, chosen.camera)

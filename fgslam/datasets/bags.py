@@ -14,8 +14,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import ReaderError as ReaderError1
-from rosbags.rosbag2 import ReaderError as ReaderError2
-from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+from rosbags.rosbag2 import ReaderError as ReaderError2, storage_mcap, storage_sqlite3
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 

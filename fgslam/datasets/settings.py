@@ -17,10 +17,12 @@ from fgslam.cameras.settings import (
     OmniCameraSettings,
 )
 from fgslam.core.settings import STRICT, FrameSelection, NonNegative, Positive
-from fgslam.worlds.settings import OmniHouseSettings as OmniHouseSettings
-from fgslam.worlds.settings import RenderedLabSettings as RenderedLabSettings
-from fgslam.worlds.settings import SimulatedBearingsSettings as SimulatedBearingsSettings
-from fgslam.worlds.settings import SimulatedMeasurementsSettings as SimulatedMeasurementsSettings
+from fgslam.worlds.settings import (
+    OmniHouseSettings as OmniHouseSettings,
+    RenderedLabSettings as RenderedLabSettings,
+    SimulatedBearingsSettings as SimulatedBearingsSettings,
+    SimulatedMeasurementsSettings as SimulatedMeasurementsSettings,
+)
 
 Vector3: TypeAlias = tuple[float, float, float]
 FramesASecond: TypeAlias = Annotated[float, Field(gt=0.0, le=1e4)]

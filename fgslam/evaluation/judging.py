@@ -32,6 +32,7 @@ from fgslam.evaluation.statistics import (
     evaluate_trajectory,
     judge,
     landmark_nees,
+    nees as normalised,
     pose_errors,
     position_errors,
     rotation_angles,
@@ -40,7 +41,6 @@ from fgslam.evaluation.statistics import (
     value_at,
     within,
 )
-from fgslam.evaluation.statistics import nees as normalised
 from fgslam.evaluation.truth import sound_truth
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.stats import norm, t as student
 
 from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray

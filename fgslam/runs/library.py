@@ -36,8 +36,7 @@ from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
 from fgslam.runs.units import Progress
 from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
-from fgslam.slam.replay import Replay
-from fgslam.slam.replay import replay as replay_log
+from fgslam.slam.replay import Replay, replay as replay_log
 
 RecordedFrame: TypeAlias = tuple[float, tuple[Image, ...] | None, Odometry | None]
 """Time in seconds, images (left, right[, top]) or None, odometry of the body or None."""

@@ -22,8 +22,7 @@ from fgslam.core.files import as_path, require_output
 from fgslam.core.geometry import so3_log
 from fgslam.core.log import Frame, MeasurementLog
 from fgslam.core.open3d_library import load_open3d
-from fgslam.core.saved_map import SavedMap, load_map, save_map
-from fgslam.core.saved_map import require_rig as require_rig_of_map
+from fgslam.core.saved_map import SavedMap, load_map, require_rig as require_rig_of_map, save_map
 from fgslam.core.sensors import CameraRig, Measured, Odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Estimate, LandmarkMap, Relocalisation, Trajectory

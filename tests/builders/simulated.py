@@ -24,8 +24,7 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
-from fgslam.worlds.driving import Drive as RobotDrive
-from fgslam.worlds.driving import drive_along
+from fgslam.worlds.driving import Drive as RobotDrive, drive_along
 from fgslam.worlds.lab import place_path
 from fgslam.worlds.settings import LabDriveSettings
 from fgslam.worlds.simulated_measurements import IdentityBook

@@ -19,8 +19,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers import admission
-from fgslam.backend.smoothers import graph as graph_builder
+from fgslam.backend.smoothers import admission, graph as graph_builder
 from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray

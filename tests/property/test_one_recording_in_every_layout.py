@@ -40,8 +40,7 @@ from dataset_builders import (
     write_euroc_truth,
     write_tum,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FgslamError

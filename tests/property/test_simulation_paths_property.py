@@ -1,8 +1,7 @@
 """Whatever the waypoints and the limits, the robot keeps to them."""
 
 import numpy as np
-from hypothesis import assume, given, reject
-from hypothesis import strategies as st
+from hypothesis import assume, given, reject, strategies as st
 from simulated import plan_drive
 
 from fgslam.core.errors import ConfigError

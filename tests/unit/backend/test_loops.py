@@ -26,6 +26,7 @@ from smoothing import FREE, PIXELS, build
 from fgslam.backend.considered import shares
 from fgslam.backend.loops import (
     CLOSURE_FACTOR,
+    FREE as UNMEASURED,
     Chain,
     Constraint,
     DriveRecord,
@@ -37,9 +38,6 @@ from fgslam.backend.loops import (
     rotated,
     transported,
     unknown_step_covariance,
-)
-from fgslam.backend.loops import (
-    FREE as UNMEASURED,
 )
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (

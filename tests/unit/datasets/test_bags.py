@@ -38,8 +38,7 @@ from fgslam.core.errors import (
     OdometryError,
     OneImageError,
 )
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD
-from fgslam.core.geometry import inverse, pose, so3_exp
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD, inverse, pose, so3_exp
 from fgslam.datasets.depth import BASELINE_M
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.opening import open_recording

@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import START_NS, gyroscope, stereo, write_bag
-from dataset_builders import PERIOD_NS, curve, euroc, image_folder, write_tum
-from dataset_builders import START_NS as EUROC_START_NS
-from hypothesis import given
-from hypothesis import strategies as st
+from dataset_builders import (
+    PERIOD_NS,
+    START_NS as EUROC_START_NS,
+    curve,
+    euroc,
+    image_folder,
+    write_tum,
+)
+from hypothesis import given, strategies as st
 from scipy import stats
 
 from fgslam.core.arrays import FloatArray

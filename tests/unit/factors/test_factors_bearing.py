@@ -11,8 +11,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import bearings
-from fgslam.factors import bearing as f
-from fgslam.factors import bearing as r
+from fgslam.factors import bearing as f, bearing as r
 from fgslam.factors.graphs import landmark_key, pose_key, target_key, velocity_key
 
 POSE = np.array([1.2, -0.5, 0.7])

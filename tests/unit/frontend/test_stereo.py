@@ -9,8 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 import pytest
 from simulated import RIG, assert_same_bits
-from textured_wall import HERE, WALL_M, pictures
-from textured_wall import RIG as WALL_RIG
+from textured_wall import HERE, RIG as WALL_RIG, WALL_M, pictures
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.correction import RigCorrection, term_names

@@ -19,8 +19,14 @@ from plotly import graph_objects as go
 from reports import HOSTILE, estimator_report, full_report, loop, picture, without_truth
 
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.page import MAX_WIDTH, embed, headline, slam_page, write_report
-from fgslam.report.page import render as render_page
+from fgslam.report.page import (
+    MAX_WIDTH,
+    embed,
+    headline,
+    render as render_page,
+    slam_page,
+    write_report,
+)
 from fgslam.report.results import EstimatorReport, ReportData
 
 

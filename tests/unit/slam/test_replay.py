@@ -23,8 +23,7 @@ from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.evaluation.judging import Truth, judge_replay
 from fgslam.factors.measurement import LandmarkModel
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.slam import build as factory
-from fgslam.slam import replay as module
+from fgslam.slam import build as factory, replay as module
 from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay
 
 SETTINGS = LandmarkKalmanSettings(label="named")

@@ -8,8 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from simulated import (
     RIG,
     Drive,

@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from known_places import RIG, Place, error, floor, planar, room, seen, things
-from rings import drive, error_m, on_ring, pipeline_of
-from rings import seen as seen_on_ring
-from simulated import RIG as SIMULATED_RIG
-from simulated import assert_same_bits
+from rings import drive, error_m, on_ring, pipeline_of, seen as seen_on_ring
+from simulated import RIG as SIMULATED_RIG, assert_same_bits
 
 from fgslam.backend.settings import EstimatorSettings, Isam2Settings, LandmarkKalmanSettings
 from fgslam.core import geometry

@@ -27,8 +27,7 @@ from fgslam.frontend.settings import (
     StereoSettings,
 )
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking import map_matching
-from fgslam.frontend.tracking import tracker as regaining
+from fgslam.frontend.tracking import map_matching, tracker as regaining
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import (
