@@ -279,7 +279,8 @@ def _components(motion: FloatArray) -> FloatArray:
     end = end_pose(Trajectory(np.array([0.0, 1.0]), np.array([np.eye(4), motion])))
     if end is None:
         raise ValueError("a trajectory of two poses has an end")
-    return np.array([end.x_cm, end.y_cm, end.z_cm, end.yaw_deg, end.pitch_deg, end.roll_deg])
+    names = ("x_cm", "y_cm", "z_cm", "yaw_deg", "pitch_deg", "roll_deg")
+    return np.array([end[name] for name in names])
 
 
 def _sigmas(tracking: EgoMotion) -> FloatArray:

@@ -8,16 +8,17 @@ of freedom, and its NEES counts direction and rotation alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import HomingEstimate, HomingTruth, home_vector_jacobian
 from fgslam.core.geometry import wrap
-from fgslam.evaluation.statistics import Consistency, Nees, judge, nees
+from fgslam.evaluation.statistics import Nees, judge, nees
 
-DIVERGED_RAD = float(np.deg2rad(30.0))
+DIVERGED_DEG = 30.0
 """A home direction further off than this leads away, not home."""
 
 _HELD = 1e-3  # legs: a smaller deviation of the target's distance is a convention
@@ -46,11 +47,9 @@ class HomingErrors:
 
     def last(self) -> HomingErrors:
         """Those of the last image alone."""
-        parts = [Nees(n.values[-1:], n.dof[-1:]) for n in self._nees()]
+        nees = (self.robot, self.target, self.joint, self.home)
+        parts = [Nees(n.values[-1:], n.dof[-1:]) for n in nees]
         return HomingErrors(self.direction[-1:], self.rotation[-1:], self.distance[-1:], *parts)
-
-    def _nees(self) -> tuple[Nees, Nees, Nees, Nees]:
-        return self.robot, self.target, self.joint, self.home
 
 
 def homing_errors(estimates: Sequence[HomingEstimate], truth: HomingTruth) -> HomingErrors:
@@ -115,58 +114,43 @@ def _polar_target(estimate: HomingEstimate) -> tuple[FloatArray, FloatArray]:
 # Many trials
 
 
-@dataclass(frozen=True, slots=True)
-class HomingSummary:
-    """What many independent homings say together.
-
-    Attributes:
-        trials: how many.
-        direction_median_deg, direction_p95_deg: of the absolute errors; likewise the others.
-        rotation_median_deg, rotation_p95_deg: of the rotation.
-        distance_median, distance_p95: of the distance left, legs; None where unknown.
-        diverged: trials whose direction is off by more than :data:`DIVERGED_RAD`, or no number.
-        unjudged: trials without a covariance of the home vector, which no NEES counts.
-        robot, target, joint, home: NEES per degree of freedom with its band; None without.
-    """
-
-    trials: int
-    direction_median_deg: float
-    direction_p95_deg: float
-    rotation_median_deg: float
-    rotation_p95_deg: float
-    distance_median: float | None
-    distance_p95: float | None
-    diverged: int
-    unjudged: int
-    robot: Consistency | None
-    target: Consistency | None
-    joint: Consistency | None
-    home: Consistency | None
+NEES_NAMES = ("robot", "target", "joint", "home")
 
 
-def summarise_homings(errors: Sequence[HomingErrors]) -> HomingSummary:
-    """Summary over trials, each with its last image.
+def summarise_homings(errors: Sequence[HomingErrors]) -> dict[str, Any]:
+    """What many independent homings, each with its last image, say together: for metrics.json.
+
+    Returns:
+        ``trials``; median and 95th percentile of the absolute errors, ``direction_median_deg``,
+        ``rotation_p95_deg`` and so on, ``distance_median`` in legs, None where unknown;
+        ``diverged``, those whose direction is off by more than :data:`DIVERGED_DEG`, or no number;
+        ``unjudged``, those without a covariance of the home vector, which no NEES counts. NEES of
+        `robot`, `target`, `joint` and `home` with its band, ``nees_robot`` and so on, and per
+        degree of freedom, ``nees_robot_per_dof``; None without.
 
     Raises:
         ValueError: there is no trial.
     """
     last = [one.last() for one in errors]
-    direction = np.abs(np.concatenate([one.direction for one in last]))
-    rotation = np.abs(np.concatenate([one.rotation for one in last]))
+    direction, rotation = (
+        np.abs(np.rad2deg(np.concatenate([getattr(one, name) for one in last])))
+        for name in ("direction", "rotation")
+    )
     distance = np.abs(np.concatenate([one.distance for one in last]))
     known = distance[np.isfinite(distance)]
-    return HomingSummary(
-        trials=len(last),
-        direction_median_deg=float(np.rad2deg(np.median(direction))),
-        direction_p95_deg=float(np.rad2deg(np.quantile(direction, 0.95))),
-        rotation_median_deg=float(np.rad2deg(np.median(rotation))),
-        rotation_p95_deg=float(np.rad2deg(np.quantile(rotation, 0.95))),
-        distance_median=float(np.median(known)) if len(known) else None,
-        distance_p95=float(np.quantile(known, 0.95)) if len(known) else None,
-        diverged=int(np.count_nonzero(~(direction <= DIVERGED_RAD))),
-        unjudged=sum(not one.home.dof.any() for one in last),
-        robot=judge([one.robot for one in last]),
-        target=judge([one.target for one in last]),
-        joint=judge([one.joint for one in last]),
-        home=judge([one.home for one in last]),
-    )
+    numbers: dict[str, Any] = {
+        "trials": len(last),
+        "direction_median_deg": float(np.median(direction)),
+        "direction_p95_deg": float(np.quantile(direction, 0.95)),
+        "rotation_median_deg": float(np.median(rotation)),
+        "rotation_p95_deg": float(np.quantile(rotation, 0.95)),
+        "distance_median": float(np.median(known)) if len(known) else None,
+        "distance_p95": float(np.quantile(known, 0.95)) if len(known) else None,
+        "diverged": int(np.count_nonzero(~(direction <= DIVERGED_DEG))),
+        "unjudged": sum(not one.home.dof.any() for one in last),
+    }
+    for name in NEES_NAMES:
+        judged = judge([getattr(one, name) for one in last])
+        numbers[f"nees_{name}_per_dof"] = None if judged is None else judged.per_dof
+        numbers[f"nees_{name}"] = None if judged is None else asdict(judged)
+    return numbers

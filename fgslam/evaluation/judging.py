@@ -19,12 +19,10 @@ from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Consistency,
-    EndPose,
     EstimatorMetrics,
     JsonValue,
     Nees,
-    TimeGrowth,
-    UpdateTime,
+    TrajectoryError,
     associate,
     best_aligned,
     end_pose,
@@ -36,6 +34,7 @@ from fgslam.evaluation.statistics import (
     pose_errors,
     position_errors,
     rotation_angles,
+    spread,
     time_growth,
     to_estimate_world,
     value_at,
@@ -183,6 +182,12 @@ class Judgement:
     nees: dict[str, Nees] = field(default_factory=dict)
 
 
+_OF_CONTRACT = (
+    *("ate_rmse_m", "rpe_trans_m", "rpe_rot_deg", "end_error_m", "end_error_deg"),
+    "nees_pose_per_dof",
+)
+
+
 def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     """All numbers of one answer.
 
@@ -190,79 +195,86 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     have the first pose aligned. Errors of the path are those of the frame whose truth is known, as
     its data set judges; NEES, which is the same for every frame, and landmarks the camera's.
     """
-    final = truth.of_same_frame(answer.estimate.trajectory)
-    online = truth.of_same_frame(answer.online)
-    sound = sound_truth(final, truth.trajectory)
-    aligned = evaluate_trajectory(final, truth.trajectory, Alignment.SE3)
-    first = evaluate_trajectory(final, sound.trajectory, Alignment.FIRST_POSE)
-    of_camera = replace(truth, trajectory=sound.trajectory).of_camera()
-    errors = _landmark_errors(answer.estimate, of_camera)
     estimate = answer.estimate
-    final_errors = _pose_errors(estimate.trajectory, estimate.covariances, of_camera)
-    online_errors = _pose_errors(answer.online, answer.online_covariances, of_camera)
-    best = (
-        _pose_errors(estimate.trajectory, estimate.covariances, of_camera, best=True),
-        _pose_errors(answer.online, answer.online_covariances, of_camera, best=True),
+    sound = sound_truth(truth.of_same_frame(estimate.trajectory), truth.trajectory)
+    of_camera = replace(truth, trajectory=sound.trajectory).of_camera()
+
+    def path_numbers(
+        poses: Trajectory, covariances: FloatArray, relative: Mapping[int, FloatArray]
+    ) -> tuple[dict[str, Any], TrajectoryError, TrajectoryError, Nees]:
+        """Of one path: its numbers, its errors by both alignments, and its NEES."""
+        path = truth.of_same_frame(poses)
+        aligned = evaluate_trajectory(path, truth.trajectory, Alignment.SE3)
+        first = evaluate_trajectory(path, sound.trajectory, Alignment.FIRST_POSE)
+        errors = _pose_errors(poses, covariances, of_camera)
+        best = judge([normalised(*_pose_errors(poses, covariances, of_camera, best=True))])
+        nees = normalised(*errors)
+        judged = judge([nees])
+        numbers = {
+            "ate_rmse_m": aligned.ate_rmse_m,
+            "ate_first_pose_m": first.ate_rmse_m,
+            "rpe_trans_m": aligned.rpe_trans_m,
+            "rpe_rot_deg": aligned.rpe_rot_deg,
+            "end_error_m": first.end_error_m,
+            "end_error_deg": first.end_error_deg,
+            "nees_pose_per_dof": _per_dof(judged),
+            "nees_pose": _as_json(judged),
+            "nees_best": _as_json(best),
+            "nees_relative": _relative(poses, relative, of_camera.trajectory),
+            "coverage": _coverage(*errors),
+        }
+        return numbers, aligned, first, nees
+
+    final, aligned, first, pose_nees = path_numbers(
+        estimate.trajectory, estimate.covariances, estimate.relative
     )
-    nees = {
-        "pose": normalised(*final_errors),
-        "online_pose": normalised(*online_errors),
-        "landmark": Nees(np.empty(0), np.empty(0, np.int64)) if errors is None else errors.nees,
-    }
-    judged = {name: judge([values]) for name, values in nees.items()}
+    online, *_, online_nees = path_numbers(
+        answer.online, answer.online_covariances, estimate.online_relative
+    )
+    distances, of_landmarks = np.empty(0), Nees(np.empty(0), np.empty(0, np.int64))
+    known = of_camera.trajectory
+    eTt = None if known is None else estimate_from_truth(estimate.trajectory, known)
+    compared = eTt is not None and truth.landmarks is not None
+    if eTt is not None and truth.landmarks is not None:
+        distances, of_landmarks = landmark_errors(estimate.landmarks, truth.landmarks, eTt)
+    judged = judge([of_landmarks])
     metrics = EstimatorMetrics(
-        ate_rmse_m=aligned.ate_rmse_m,
-        rpe_trans_m=aligned.rpe_trans_m,
-        rpe_rot_deg=aligned.rpe_rot_deg,
+        **{name: final.pop(name) for name in _OF_CONTRACT},
         drift_percent=first.drift_percent,
-        end_error_m=first.end_error_m,
-        end_error_deg=first.end_error_deg,
-        landmarks=len(answer.estimate.landmarks),
-        nees_pose_per_dof=_per_dof(judged["pose"]),
-        nees_landmark_per_dof=_per_dof(judged["landmark"]),
-        update_ms=UpdateTime.of(answer.update_ms),
+        landmarks=len(estimate.landmarks),
+        nees_landmark_per_dof=_per_dof(judged),
+        update_ms=spread(answer.update_ms),
         peak_memory_mb=answer.peak_memory_mb,
         more={
-            "frames": max(len(answer.online), len(final)),
+            "frames": max(len(answer.online), len(estimate.trajectory)),
             "predicted_frames": int(answer.predicted.sum()),
             "predicted_rows": np.flatnonzero(answer.predicted).tolist(),
             "alignment": aligned.alignment.value,
             "matched_poses": aligned.matched_poses,
             "ate_max_m": aligned.ate_max_m,
-            "ate_first_pose_m": first.ate_rmse_m,
             "path_length_m": aligned.path_length_m,
-            "nees_pose": _as_json(judged["pose"]),
-            "nees_landmark": _as_json(judged["landmark"]),
-            "nees_best": _as_json(judge([normalised(*best[0])])),
-            "nees_relative": _relative(
-                estimate.trajectory, estimate.relative, of_camera.trajectory
-            ),
-            "coverage": _coverage(*final_errors),
-            "online": _online(online, truth.trajectory, sound.trajectory, judged["online_pose"])
-            | {
-                "coverage": _coverage(*online_errors),
-                "nees_best": _as_json(judge([normalised(*best[1])])),
-                "nees_relative": _relative(
-                    answer.online, estimate.online_relative, of_camera.trajectory
-                ),
-            },
-            "landmark_rmse_m": None if errors is None else errors.rmse_m,
-            "landmark_median_m": None if errors is None else errors.median_m,
-            "landmarks_with_truth": None if errors is None else len(errors),
+            **final,
+            "nees_landmark": _as_json(judged),
+            "online": online,
+            "landmark_rmse_m": float(np.sqrt(np.mean(distances**2))) if len(distances) else None,
+            "landmark_median_m": float(np.median(distances)) if len(distances) else None,
+            "landmarks_with_truth": len(distances) if compared else None,
             "landmark_truth_sigma_m": truth.landmark_sigma_m,
             **_innovations(answer),
-            "update_growth": _as_json(time_growth(answer.update_ms)),
-            **_claims(answer.estimate),
+            "update_growth": time_growth(answer.update_ms),
+            **_claims(estimate),
             # Se et al. (5) measure by it how well a loop closes.
-            "end_against_start": _as_json(end_pose(answer.estimate.trajectory)),
-            "noise_factor": answer.estimate.noise_factor,
-            "remarks": [*answer.estimate.remarks, *filter(None, [sound.why])],
+            "end_against_start": end_pose(estimate.trajectory),
+            "noise_factor": estimate.noise_factor,
+            "remarks": [*estimate.remarks, *filter(None, [sound.why])],
             "judged_poses": first.matched_poses,
             "truth_left_out": sound.left_out.tolist(),
             "truth_remark": sound.why or None,
         },
     )
-    return Judgement(metrics, nees)
+    return Judgement(
+        metrics, {"pose": pose_nees, "online_pose": online_nees, "landmark": of_landmarks}
+    )
 
 
 def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
@@ -274,7 +286,7 @@ def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
         | dict(metrics.more)
         | {
             "failure": replay.failure or None,
-            "solve_ms": asdict(UpdateTime.of(replay.column("solve_ms").astype(np.float64))),
+            "solve_ms": spread(replay.column("solve_ms").astype(np.float64)),
             "final_ms": replay.final_ms,
             "memory_before_mb": replay.memory_before_mb,
             **closure_counts(replay.closed),
@@ -320,7 +332,7 @@ def _per_dof(found: Consistency | None) -> float | None:
     return None if found is None else found.per_dof
 
 
-def _as_json(found: Consistency | TimeGrowth | EndPose | None) -> JsonValue:
+def _as_json(found: Consistency | None) -> JsonValue:
     return None if found is None else asdict(found)
 
 
@@ -387,31 +399,6 @@ def _coverage(errors: FloatArray, covariances: FloatArray) -> JsonValue:
     return {"rotation": shares[:3], "position": shares[3:], "all": float(np.nanmean(axes))}
 
 
-def _landmark_errors(estimate: Estimate, truth: Truth) -> LandmarkErrors | None:
-    if truth.landmarks is None or truth.trajectory is None:
-        return None
-    eTt = estimate_from_truth(estimate.trajectory, truth.trajectory)
-    return None if eTt is None else landmark_errors(estimate.landmarks, truth.landmarks, eTt)
-
-
-def _online(
-    online: Trajectory, truth: Trajectory | None, sound: Trajectory | None, nees: Consistency | None
-) -> dict[str, JsonValue]:
-    """The same errors of the poses as they were first estimated."""
-    aligned = evaluate_trajectory(online, truth, Alignment.SE3)
-    first = evaluate_trajectory(online, sound, Alignment.FIRST_POSE)
-    return {
-        "ate_rmse_m": aligned.ate_rmse_m,
-        "ate_first_pose_m": first.ate_rmse_m,
-        "rpe_trans_m": aligned.rpe_trans_m,
-        "rpe_rot_deg": aligned.rpe_rot_deg,
-        "end_error_m": first.end_error_m,
-        "end_error_deg": first.end_error_deg,
-        "nees_pose_per_dof": _per_dof(nees),
-        "nees_pose": _as_json(nees),
-    }
-
-
 def _innovations(answer: Answer) -> dict[str, JsonValue]:
     """NIS of the matched observations, each frame an independent item."""
     known = np.isfinite(answer.nis) & (answer.nis_dof > 0)
@@ -437,38 +424,10 @@ def _claims(estimate: Estimate) -> dict[str, JsonValue]:
     return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LandmarkErrors:
-    """Distances of landmarks from where they truly are.
-
-    Attributes:
-        ids: (n,) landmarks of the map whose truth is known, ascending.
-        distances_m: (n,) metres.
-        nees: of each, three degrees of freedom where its covariance is known.
-    """
-
-    ids: IntArray
-    distances_m: FloatArray
-    nees: Nees
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    @property
-    def rmse_m(self) -> float | None:
-        """Root mean square distance; None without a landmark."""
-        return float(np.sqrt(np.mean(self.distances_m**2))) if len(self) else None
-
-    @property
-    def median_m(self) -> float | None:
-        """Median distance, which a few wrong identities do not spoil; None without a landmark."""
-        return float(np.median(self.distances_m)) if len(self) else None
-
-
 def landmark_errors(
     landmarks: LandmarkMap, truth: LandmarkTruth, eTt: FloatArray
-) -> LandmarkErrors:
-    """Compares the landmarks that both know.
+) -> tuple[FloatArray, Nees]:
+    """Distances (n,) in metres of the landmarks that both know, by identity; and their NEES.
 
     Args:
         landmarks: of the estimate, in its world.
@@ -477,14 +436,11 @@ def landmark_errors(
             the poses' NEES (:func:`fgslam.evaluation.statistics.estimate_from_truth`). That adds
             no uncertainty where the first pose is the gauge of the estimate's world.
     """
-    ids, rows, of = np.intersect1d(landmarks.ids, truth.ids, return_indices=True)
+    _, rows, of = np.intersect1d(landmarks.ids, truth.ids, return_indices=True)
     true = transform_to_world(eTt, truth.positions[of])
     positions = landmarks.positions[rows]
-    return LandmarkErrors(
-        ids=ids,
-        distances_m=np.linalg.norm(positions - true, axis=1),
-        nees=landmark_nees(positions, landmarks.covariances[rows], true),
-    )
+    distances = np.linalg.norm(positions - true, axis=1)
+    return distances, landmark_nees(positions, landmarks.covariances[rows], true)
 
 
 Comparable: TypeAlias = Replayed | Answer | Estimate

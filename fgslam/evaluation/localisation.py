@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.geometry import inverse
-from fgslam.evaluation.statistics import pose_nees, rotation_angles
+from fgslam.evaluation.statistics import pose_nees, rotation_angles, spread
 
 _HELD = 0.95
 
@@ -68,16 +68,6 @@ class LocalisationErrors:
     dof: IntArray
 
 
-def spread(values: FloatArray) -> dict[str, float | None]:
-    """``median``, 95th percentile ``p95`` and ``max`` of what is known; None where nothing is."""
-    known = values[np.isfinite(values)]
-    quantiles = {"median": 50.0, "p95": 95.0, "max": 100.0}
-    return {
-        name: float(np.percentile(known, q)) if len(known) else None
-        for name, q in quantiles.items()
-    }
-
-
 def localisation_errors(answers: Answers) -> LocalisationErrors:
     """Errors of the accepted poses against the truth."""
     known = answers.accepted & np.isfinite(answers.truth).all(axis=(1, 2))
@@ -99,7 +89,7 @@ def score(answers: Answers, bounds: Bounds) -> dict[str, Any]:
     Returns:
         Queries ``asked``; ``accepted``, poses that were trusted; ``with_truth``, how many have a
         truth: the rest is over these. Of the accepted ``right``, within the bounds, ``false``,
-        somewhere else, and ``inexact``, neither; ``share_right``. :func:`spread` of ``error_m`` and
+        somewhere else, and ``inexact``, neither; ``share_right``. The spread of ``error_m`` and
         ``error_deg`` of those accepted; the mean ``nees_per_dof``, and ``share_in_95_percent`` of
         the true poses in that region of the covariance. None where unknown.
     """

@@ -58,25 +58,6 @@ class TrajectoryError:
     end_error_deg: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class EndPose:
-    """The last pose as seen from the first one: how well a closed drive closes (Se et al. 5).
-
-    Attributes:
-        x_cm, y_cm, z_cm: right, down and ahead, in the first camera's frame, centimetres.
-        distance_cm: length of that vector.
-        yaw_deg, pitch_deg, roll_deg: clockwise from above, up, clockwise, degrees.
-    """
-
-    x_cm: float
-    y_cm: float
-    z_cm: float
-    distance_cm: float
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float
-
-
 # --------------------------------------------------------------------------------------------
 # Association
 
@@ -251,15 +232,20 @@ def evaluate_trajectory(
     )
 
 
-def end_pose(trajectory: Trajectory) -> EndPose | None:
-    """Last pose against the first one, in the paper's units; None for an empty trajectory."""
+def end_pose(trajectory: Trajectory) -> dict[str, float] | None:
+    """The last pose as seen from the first one: how well a closed drive closes (Se et al. 5).
+
+    Returns:
+        ``x_cm``, ``y_cm``, ``z_cm``, right, down and ahead in the first camera's frame, and
+        ``distance_cm``, their length; ``yaw_deg``, ``pitch_deg``, ``roll_deg``, clockwise from
+        above, up, clockwise. None for an empty trajectory.
+    """
     if len(trajectory) == 0:
         return None
     sTe = inverse(trajectory.poses[0]) @ trajectory.poses[-1]
-    x, y, z = (100.0 * sTe[:3, 3]).tolist()
-    yaw, pitch, roll = np.degrees(yaw_pitch_roll(sTe)).tolist()
-    distance = float(100.0 * np.linalg.norm(sTe[:3, 3]))
-    return EndPose(x, y, z, distance, yaw, pitch, roll)
+    lengths = [*(100.0 * sTe[:3, 3]).tolist(), float(100.0 * np.linalg.norm(sTe[:3, 3]))]
+    names = ("x_cm", "y_cm", "z_cm", "distance_cm", "yaw_deg", "pitch_deg", "roll_deg")
+    return dict(zip(names, (*lengths, *np.degrees(yaw_pitch_roll(sTe)).tolist()), strict=True))
 
 
 def to_estimate_world(
@@ -492,21 +478,14 @@ JsonValue: TypeAlias = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class UpdateTime:
-    """Milliseconds an estimator took for a frame; None where none was timed."""
-
-    median: float | None = None
-    p95: float | None = None
-    max: float | None = None
-
-    @staticmethod
-    def of(milliseconds: FloatArray) -> UpdateTime:
-        """Statistics of the times (n,) of all frames."""
-        if len(milliseconds) == 0:
-            return UpdateTime()
-        median, p95 = np.percentile(milliseconds, [50.0, 95.0])
-        return UpdateTime(float(median), float(p95), float(np.max(milliseconds)))
+def spread(values: FloatArray) -> dict[str, float | None]:
+    """``median``, 95th percentile ``p95`` and ``max`` of what is known; None where nothing is."""
+    known = values[np.isfinite(values)]
+    quantiles = {"median": 50.0, "p95": 95.0, "max": 100.0}
+    return {
+        name: float(np.percentile(known, q)) if len(known) else None
+        for name, q in quantiles.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -520,7 +499,7 @@ class EstimatorMetrics:
         end_error_m, end_error_deg: error of the last pose against truth, first pose aligned.
         landmarks: number of landmarks in the final map.
         nees_pose_per_dof, nees_landmark_per_dof: 1 is consistent, more is overconfident.
-        update_ms: time for a frame.
+        update_ms: milliseconds for a frame, their :func:`spread`.
         peak_memory_mb: largest resident memory of the process, mebibytes.
         more: further values, under names of their own.
     """
@@ -534,7 +513,7 @@ class EstimatorMetrics:
     landmarks: int | None = None
     nees_pose_per_dof: float | None = None
     nees_landmark_per_dof: float | None = None
-    update_ms: UpdateTime = field(default_factory=UpdateTime)
+    update_ms: Mapping[str, float | None] = field(default_factory=lambda: spread(np.empty(0)))
     peak_memory_mb: float | None = None
     more: Mapping[str, JsonValue] = field(default_factory=dict)
 
@@ -558,22 +537,14 @@ def value_at(values: Mapping[str, Any], where: str) -> Any:
 _LEAST_FRAMES = 25  # five a fifth: the median of fewer is noise
 
 
-@dataclass(frozen=True, slots=True)
-class TimeGrowth:
-    """Growth of the time a frame.
+def time_growth(milliseconds: FloatArray) -> dict[str, float] | None:
+    """Growth of times (n,) of consecutive frames; None for fewer than 25 of them.
 
-    Attributes:
-        ratio: median of the last fifth of the frames over that of the second fifth (the first
-            holds what is slow only once); 1 is flat, 4 is proportional to the frames so far.
-        slope_ms_per_1000: least-squares slope, milliseconds a thousand frames.
+    Returns:
+        ``ratio``: median of the last fifth of the frames over that of the second fifth (the first
+        holds what is slow only once); 1 is flat, 4 is proportional to the frames so far.
+        ``slope_ms_per_1000``: least-squares slope, milliseconds a thousand frames.
     """
-
-    ratio: float
-    slope_ms_per_1000: float
-
-
-def time_growth(milliseconds: FloatArray) -> TimeGrowth | None:
-    """Growth of times (n,) of consecutive frames; None for fewer than 25 of them."""
     n = len(milliseconds)
     if n < _LEAST_FRAMES:
         return None
@@ -582,4 +553,4 @@ def time_growth(milliseconds: FloatArray) -> TimeGrowth | None:
     if not early > 0.0:
         return None
     slope = np.polyfit(np.arange(n, dtype=np.float64), milliseconds, 1)[0]
-    return TimeGrowth(float(late / early), float(1000.0 * slope))
+    return {"ratio": float(late / early), "slope_ms_per_1000": float(1000.0 * slope)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, astuple, fields, replace
+from dataclasses import astuple, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from fgslam.evaluation.judging import (
     judge_closures,
     predicted_poses,
 )
-from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, spread
 from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.report.content import (
     Cell,
@@ -129,16 +129,16 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
     correlations = correlation(np.array(recorder.online_covariances[1:]).reshape(-1, 6, 6))
     return {
         "status_counts": dict(sorted(Counter(recorder.column("status").tolist()).items())),
-        "features": spread(recorder.column("features")),
-        "stereo_matches": spread(recorder.column("stereo")),
-        "landmark_matches": spread(recorder.column("inliers")[1:]),
+        "features": count_spread(recorder.column("features")),
+        "stereo_matches": count_spread(recorder.column("stereo")),
+        "landmark_matches": count_spread(recorder.column("inliers")[1:]),
         "mean_residual_px": _of_known(np.median, recorder.column("mean_residual_px")),
         "stereo_precision": _of_known(np.mean, recorder.column("stereo_precision")),
         "correlation_x_yaw": float(np.median(correlations[:, 1, 3])) if len(correlations) else None,
         "frames_without_image": int(np.count_nonzero(recorder.column("status") == _NO_IMAGE)),
         "frame_problems": frame_problems(recorder),
-        "loop_ms": asdict(UpdateTime.of(_stage_sum(times, _LOOP_STAGES))),
-        "sift_ms": asdict(UpdateTime.of(_stage_sum(times, ("sift",)))),
+        "loop_ms": spread(_stage_sum(times, _LOOP_STAGES)),
+        "sift_ms": spread(_stage_sum(times, ("sift",))),
     }
 
 
@@ -197,7 +197,7 @@ def _stage_sum(times: FloatArray, stages: tuple[str, ...]) -> FloatArray:
     return np.asarray(times[:, [STAGES.index(stage) for stage in stages]].sum(axis=1))
 
 
-def spread(counts: IntArray) -> JsonValue:
+def count_spread(counts: IntArray) -> JsonValue:
     """Extremes, median and 5 % quantiles; None of nothing."""
     if not len(counts):
         return None

@@ -26,7 +26,7 @@ from fgslam.core.kernels import make_kernels
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_checked, open_house
-from fgslam.evaluation.statistics import JsonValue, UpdateTime
+from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.homing.tracking import ReplenishedTracker
 from fgslam.homing.active import ActiveHoming
 from fgslam.homing.api import teach
@@ -347,7 +347,7 @@ def drive_numbers(records: Sequence[DriveRecord], failed: int = 0) -> dict[str, 
         if records
         else None,
         "stage_ms": {
-            name: asdict(UpdateTime.of(1e3 * np.concatenate([r.seconds[name] for r in records])))
+            name: spread(1e3 * np.concatenate([r.seconds[name] for r in records]))
             if records
             else None
             for name in STAGES
@@ -686,6 +686,6 @@ def _numbers(tracks: _Tracks) -> dict[str, JsonValue]:
         "ended_track_life_median_frames": median(lives[ended]),
         "alive_at_the_end": int(np.count_nonzero(~ended)),
         "frames_a_second": 1e3 * len(tracks.frames) / spent if spent else None,
-        "track_ms": asdict(UpdateTime.of(np.array(tracks.track_ms))),
-        "read_ms": asdict(UpdateTime.of(np.array(tracks.read_ms))),
+        "track_ms": spread(np.array(tracks.track_ms)),
+        "read_ms": spread(np.array(tracks.read_ms)),
     }

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -32,8 +32,8 @@ from fgslam.core.bearings import (
 from fgslam.core.errors import DatasetError, EstimatorError
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.opening import open_simulated_homing
-from fgslam.evaluation.homing import HomingErrors, HomingSummary, homing_errors, summarise_homings
-from fgslam.evaluation.statistics import JsonValue, UpdateTime
+from fgslam.evaluation.homing import NEES_NAMES, HomingErrors, homing_errors, summarise_homings
+from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.frontend.settings import HomingVectorSettings
@@ -47,7 +47,6 @@ from fgslam.runs.results import finish, number_text
 LOG_FOLDER = "logs"
 ESTIMATES_FILE = "estimates.csv"
 TRIALS_A_BLOCK = 20  # trials a process: starting one takes as long as some trials
-NEES_NAMES = ("robot", "target", "joint", "home")
 # Judged where a fifth of the leg is left, as simulated homings end there: nearer to the target its
 # direction means less and less.
 _LEFT = 0.199
@@ -154,22 +153,14 @@ def _finished(homings: Iterable[JudgedHoming]) -> list[HomingErrors]:
     return [one.errors for one in homings if one.errors is not None and not one.failure]
 
 
-def _update_time(homings: Iterable[JudgedHoming]) -> UpdateTime:
-    return UpdateTime.of(np.concatenate([np.empty(0), *(one.update_ms for one in homings)]))
+def _update_times(homings: Iterable[JudgedHoming]) -> dict[str, float | None]:
+    return spread(np.concatenate([np.empty(0), *(one.update_ms for one in homings)]))
 
 
 def _summary_numbers(homings: Iterable[JudgedHoming]) -> dict[str, Any]:
     """Numbers of metrics.json: of the homings that the estimator finished."""
     errors = _finished(homings)
-    if not errors:
-        return {"trials": 0}
-    summary = asdict(summarise_homings(errors))
-    values = {name: summary[name] for name in HomingSummary.__slots__ if name not in NEES_NAMES}
-    for name in NEES_NAMES:
-        judged = summary[name]
-        values[f"nees_{name}_per_dof"] = None if judged is None else judged["per_dof"]
-        values[f"nees_{name}"] = judged
-    return values
+    return summarise_homings(errors) if errors else {"trials": 0}
 
 
 def _estimator_numbers(
@@ -181,7 +172,7 @@ def _estimator_numbers(
     return {
         "kind": settings.kind,
         **summary,
-        "update_ms": asdict(_update_time(homings.values())),
+        "update_ms": _update_times(homings.values()),
         "failures": [f"{name}: {one.failure}" for name, one in homings.items() if one.failure],
     }
 
@@ -195,7 +186,7 @@ def _estimator_table(
         numbers = _summary_numbers(judged)
         failed = sum(bool(one.failure) for one in judged)
         numbers["diverged"] = numbers.get("diverged", 0) + failed
-        numbers["update_ms"] = _update_time(judged).median
+        numbers["update_ms"] = _update_times(judged)["median"]
         cells = tuple(_cell(numbers.get(name), spec) for _, name, spec, _ in _COLUMNS)
         rows.append((title, cells))
     columns = tuple(Column(name, meaning) for name, _, _, meaning in _COLUMNS)
@@ -264,7 +255,7 @@ def _run_trials(config: HomingTrialsConfig, context: Context) -> RunResult:
     save_bearing_logs(folder, logs)
     write_csv(folder / TRIALS_FILE, _TRIAL_COLUMNS, _trial_rows(trials))
     times = (
-        (one.share, one.trial, title, *asdict(UpdateTime.of(judged.update_ms)).values())
+        (one.share, one.trial, title, *spread(judged.update_ms).values())
         for one in trials
         for title, judged in one.tried.items()
     )

@@ -35,9 +35,8 @@ from fgslam.evaluation.localisation import (
     enough,
     localisation_errors,
     score,
-    spread,
 )
-from fgslam.evaluation.statistics import JsonValue
+from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.report.content import Column, Figure, TextTable, write_csv, write_json
 from fgslam.report.homing_figures import Located, located_figure

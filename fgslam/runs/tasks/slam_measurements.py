@@ -16,7 +16,7 @@ from fgslam.report.content import write_timing
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.folder import LOG_FILE
-from fgslam.runs.report import spread
+from fgslam.runs.report import count_spread
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
 from fgslam.runs.tables import FRAMES_FILE, read_frames
 from fgslam.slam.replay import ReplayRow
@@ -78,5 +78,5 @@ def _about(
         "remark": config.remark or None,
         "notes": list(recording.notes),
         "status_counts": dict(sorted(Counter(row.status for row in rows).items())),
-        "landmark_matches": spread(np.array([row.inliers for row in rows[1:]], np.int64)),
+        "landmark_matches": count_spread(np.array([row.inliers for row in rows[1:]], np.int64)),
     }

@@ -186,9 +186,10 @@ def test_end_pose_in_the_papers_units() -> None:
     motion = pose(so3_exp(np.array([0, np.radians(0.3), 0])), [-0.0209, 0.0, -0.0391])
     closed = end_pose(Trajectory(np.arange(2.0), np.array([start, start @ motion])))
     assert closed is not None
-    assert (closed.x_cm, closed.y_cm, closed.z_cm) == pytest.approx((-2.09, 0.0, -3.91))
-    assert closed.distance_cm == pytest.approx(np.hypot(2.09, 3.91))
-    assert (closed.yaw_deg, closed.pitch_deg, closed.roll_deg) == pytest.approx((0.3, 0, 0))
+    assert closed == pytest.approx(
+        {"x_cm": -2.09, "y_cm": 0.0, "z_cm": -3.91, "distance_cm": np.hypot(2.09, 3.91)}
+        | {"yaw_deg": 0.3, "pitch_deg": 0.0, "roll_deg": 0.0}
+    )
     assert end_pose(Trajectory(np.empty(0), np.empty((0, 4, 4)))) is None
 
 

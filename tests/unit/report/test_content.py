@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.evaluation.statistics import EstimatorMetrics, UpdateTime
+from fgslam.evaluation.statistics import EstimatorMetrics, spread
 from fgslam.report.content import (
     SIGMAS,
     Column,
@@ -154,7 +154,7 @@ def test_values_and_further_values(tmp_path: Path) -> None:
         ate_rmse_m=float(np.float64(0.012)),
         drift_percent=float("nan"),
         landmarks=3590,
-        update_ms=UpdateTime.of(np.arange(101.0)),
+        update_ms=spread(np.arange(101.0)),
         more={"alignment": "se3", "band": np.array([0.5, 1.5]), "matched_poses": np.int64(249)},
     )
     path = tmp_path / "metrics.json"

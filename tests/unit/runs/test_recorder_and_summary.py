@@ -225,7 +225,7 @@ def test_a_perfect_path_has_no_error_in_any_world() -> None:
     assert metrics.nees_pose_per_dof == pytest.approx(0.0, abs=1e-9)
     assert value_at(metrics.more, "coverage.all") == 1.0
     assert metrics.landmarks == 7
-    assert metrics.update_ms.median == 8.5  # predict 1 and update 4 to 11
+    assert metrics.update_ms["median"] == 8.5  # predict 1 and update 4 to 11
     assert metrics.peak_memory_mb is not None
     assert 10.0 < metrics.peak_memory_mb < 1e5
 
