@@ -275,7 +275,8 @@ def _require_finite(path: Path, **arrays: FloatArray) -> None:
 # --------------------------------------------------------------------------------------------
 # g2o
 
-GRAPH_SUFFIX = ".g2o"
+GRAPH = "graph", (".g2o",)
+"""What it is called, and the ending of its files."""
 EXACT_SIGMA = 1e-6
 """Standard deviation (m, rad) in place of zero: a file of information cannot say `exact`."""
 
@@ -311,14 +312,6 @@ class PoseLandmarkGraph:
     point_covariances: FloatArray
 
 
-def require_graph_suffix(path: Path) -> None:
-    """Raises OutputError unless the file's name ends in .g2o."""
-    if path.suffix.lower() != GRAPH_SUFFIX:
-        raise OutputError(
-            f"cannot write {path}: unknown graph format '{path.suffix}'; use {GRAPH_SUFFIX}"
-        )
-
-
 def write_g2o(path: Path, graph: PoseLandmarkGraph, remarks: Sequence[str] = ()) -> None:
     """Writes a graph atomically; the same graph gives the same bytes.
 
@@ -332,7 +325,7 @@ def write_g2o(path: Path, graph: PoseLandmarkGraph, remarks: Sequence[str] = ())
     Raises:
         OutputError: another ending, a number that is not finite, or writing failed.
     """
-    require_graph_suffix(path)
+    require_suffix(path, *GRAPH)
     arrays = ("poses", "landmarks", "motions", "motion_covariances", "points")
     _require_finite(path, **{name: getattr(graph, name) for name in arrays})
     n, (i3, j3), (i6, j6) = len(graph.poses), np.triu_indices(3), np.triu_indices(6)

@@ -39,13 +39,13 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.content import read_metrics
 from fgslam.report.formats import (
+    GRAPH,
     MCAP_SUFFIX,
     Axes,
     ImageModel,
     MapPoints,
     PoseLandmarkGraph,
     read_ply,
-    require_graph_suffix,
     require_suffix,
     write_colmap,
     write_g2o,
@@ -58,6 +58,7 @@ from fgslam.runs.dense import DenseMap, DenseSettings, Pictures, fuse, readers_o
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
+from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.units import Progress
 from fgslam.slam.build import chosen_estimator
 from fgslam.slam.replay import replay
@@ -223,9 +224,10 @@ def graph_of_run(run: Path, estimator: str | EstimatorSettings | None = None) ->
     Raises:
         FgslamError: no run of SLAM, or the estimator fails on its log or keeps no whole graph.
     """
-    config, log = load_config(run / RUN_MARKER), MeasurementLog.load(log_of(run))
-    chosen = chosen_estimator(estimator or config.estimator)
-    found = replay(log, chosen, config.frontend.ego_motion)
+    config, path = load_config(run / RUN_MARKER), log_of(run)
+    chosen, arrival = chosen_estimator(estimator or config.estimator), arrival_of(path.parent)
+    log = MeasurementLog.load(path)
+    found = replay(log, chosen, config.frontend.ego_motion, arrival=arrival)
     if found.failure:
         raise EstimatorError(f"{found.kind}: {found.failure}")
     return found.graph()
@@ -244,7 +246,7 @@ def _require_outputs(run: Path, wanted: Wanted) -> None:
     if wanted.images is not None:
         require_output(wanted.images, wanted.overwrite, inputs, folder=True)
     if wanted.graph is not None and not run.is_file():
-        require_graph_suffix(wanted.graph)
+        require_suffix(wanted.graph, *GRAPH)
     if wanted.dense is not None:
         require_suffix(wanted.dense, *CLOUD)
     if wanted.mesh is not None:
