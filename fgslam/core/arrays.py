@@ -202,6 +202,13 @@ class GrowingColumns:
 # Quantiles of the distributions that bounds and gates come from
 
 
+def thinned(count: int, limit: int) -> IntArray:
+    """At most ``limit`` of ``count`` rows, evenly spread, with the first and the last."""
+    if count <= limit:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
+
+
 def chi_square_quantile(probability: ArrayLike, dof: ArrayLike) -> FloatArray:
     """Values that a chi-square variable of ``dof`` degrees stays below with that probability."""
     from scipy.special import gammaincinv  # light modules do not load SciPy

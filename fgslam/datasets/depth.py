@@ -21,7 +21,7 @@ from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import View, pixel_grid, sampling_maps
 from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
 from fgslam.cameras.trees import intrinsic_matrix, read_tree
-from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image
+from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, thinned
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_lines, shown_in
@@ -34,7 +34,6 @@ from fgslam.datasets.images import (
     read_colour_image,
     read_depth_image,
     require_size,
-    spread_over,
 )
 from fgslam.datasets.layouts import (
     CameraFiles,
@@ -366,7 +365,7 @@ def sample_depths(
 ) -> tuple[FloatArray, bool]:
     """Known depths (n,) of some images, in their own units, and whether these are integers."""
     images, faults = [], [""]
-    for row in spread_over(count, _SAMPLES):
+    for row in thinned(count, _SAMPLES).tolist():
         try:
             images.append(read(row))
         except FrameError as fault:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.rig import StereoRig
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import Image, thinned
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OneImageError
 from fgslam.core.files import require_file
 from fgslam.core.sensors import CAMERA_NAMES
@@ -191,11 +191,6 @@ def readable(read: Callable[[_P], _T], places: Iterable[_P]) -> Iterator[_T]:
         yield found
 
 
-def spread_over(count: int, most: int) -> list[int]:
-    """At most so many of the numbers 0 to ``count`` - 1, all over them."""
-    return [int(k) for k in np.unique(np.linspace(0, count - 1, most).astype(int))]
-
-
 def require_folder(path: Path, what: str) -> None:
     """Raises DatasetError unless the folder exists."""
     if not path.is_dir():
@@ -369,7 +364,7 @@ def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[in
         stored: the pixels of a frame as they are stored; raises FrameError.
     """
     largest = 0
-    for pixels in readable(stored, spread_over(count, _SAMPLED_FRAMES)):
+    for pixels in readable(stored, thinned(count, _SAMPLED_FRAMES).tolist()):
         if pixels.dtype != np.uint16:
             return 16, ()
         largest = max(largest, int(pixels.max()))

@@ -20,7 +20,7 @@ import numpy as np
 from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
 from fgslam.cameras.omni_files import make_camera
 from fgslam.cameras.rings import MirrorCircle, find_mirror_circle
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray, thinned
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.files import read_text, shown_in
 from fgslam.core.geometry import wrap
@@ -29,7 +29,6 @@ from fgslam.datasets.images import (
     readable,
     require_folder,
     require_size,
-    spread_over,
 )
 from fgslam.datasets.layouts import IMAGE_SUFFIXES, natural
 from fgslam.datasets.recording import recording_identity, select_frames
@@ -406,7 +405,7 @@ def _end_notes(recording: OmniRecording, camera: Equirectangular) -> tuple[str, 
     """
     at_pole = np.isclose([camera.top_elevation, -camera.bottom_elevation], 0.5 * np.pi)
     found = []
-    for image in readable(recording.image, spread_over(len(recording), _SPREAD_OVER)):
+    for image in readable(recording.image, thinned(len(recording), _SPREAD_OVER).tolist()):
         grey = image.mean(axis=2)
         lit = np.flatnonzero(grey.max(axis=0) > _BLACK)
         if not len(lit):

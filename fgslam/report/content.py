@@ -208,13 +208,6 @@ def bulk_limits(path: FloatArray, *maps: FloatArray) -> list[list[float]]:
     return limits
 
 
-def thinned(count: int, limit: int) -> IntArray:
-    """At most ``limit`` of ``count`` rows, evenly spread, with the first and the last."""
-    if count <= limit:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
-
-
 def peaks(values: FloatArray, limit: int) -> IntArray:
     """Rows of values (n,) so thinned that the largest of each part stays; NaN only if alone."""
     if len(values) <= limit:
@@ -455,6 +448,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def metres(value: float | None) -> str:
+    """A length to be read: centimetres below a metre."""
+    if value is None:
+        return "unknown"
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
 
 
 # --------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, thinned
 from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer, Comparable, require_named
 from fgslam.evaluation.statistics import to_estimate_world
@@ -36,7 +36,6 @@ from fgslam.report.content import (
     level_axes,
     outlines,
     peaks,
-    thinned,
     world_position_covariances,
 )
 from fgslam.report.results import (

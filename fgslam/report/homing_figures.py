@@ -11,7 +11,7 @@ import numpy as np
 from plotly import graph_objects as go
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, thinned
 from fgslam.core.bearings import HomingEstimate, HomingTruth
 from fgslam.report.content import (
     GREY,
@@ -24,7 +24,6 @@ from fgslam.report.content import (
     level_axes,
     outlines,
     peaks,
-    thinned,
     world_position_covariances,
 )
 from fgslam.report.figures import HOVER_PLACE, MAX_POINTS, colour, curve, dots, drawing, line, plane

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from fgslam.core.files import write_text
 from fgslam.report import figures as drawn
-from fgslam.report.content import Drive, Page, Picture, plain
+from fgslam.report.content import Drive, Page, Picture, metres, plain
 from fgslam.report.results import EstimatorReport, ReportData
 
 MAX_WIDTH = 1100
@@ -220,11 +220,6 @@ def headline(data: ReportData) -> tuple[str, ...]:
     lines += [f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark][:1]
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     return tuple(lines)
-
-
-def metres(value: float) -> str:
-    """A length to be read: centimetres below a metre."""
-    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
 
 
 def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:

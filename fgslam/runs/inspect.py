@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import FloatArray, Image, thinned
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.geometry import inverse, se3_log, so3_log
 from fgslam.core.log import ImageSequence
@@ -36,7 +36,7 @@ from fgslam.runs.findings import (
     first_of,
     share,
 )
-from fgslam.runs.inspect_matches import Facts, check_matches, match_facts, match_frames, spread_over
+from fgslam.runs.inspect_matches import Facts, check_matches, match_facts, match_frames
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.units import Progress
 
@@ -142,7 +142,7 @@ def check_images(
 
     Reads up to ``samples`` frames, evenly spread, with the first and the last.
     """
-    chosen = spread_over(sequence, samples)
+    chosen = thinned(len(sequence), samples).tolist()
     unreadable: list[str] = []
     # Of every image frame, camera, kind, mean grey value, and equality to the right one: the images
     # of a long recording would fill the memory.

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, Rows
+from fgslam.core.arrays import FloatArray, IntArray, Rows, thinned
 from fgslam.core.errors import FrameError
 from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
@@ -29,12 +29,6 @@ from fgslam.runs.units import Progress
 
 Facts: TypeAlias = tuple[tuple[str, str], ...]
 """Labels and values."""
-
-
-def spread_over(sequence: ImageSequence, samples: int) -> list[int]:
-    """Positions of up to ``samples`` frames, evenly spread, with the first and the last."""
-    count = min(samples, len(sequence))
-    return np.unique(np.linspace(0, len(sequence) - 1, count).astype(np.int64)).tolist()  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +127,7 @@ def match_frames(
     # Descriptors are needed whatever the run makes of them.
     extractor = SiftExtractor(settings.sift, "descriptor")
     matcher = StereoMatcher(sequence.rig, settings.stereo, settings.appearance)
-    chosen = spread_over(sequence, frames)
+    chosen = thinned(len(sequence), frames).tolist()
     numbers: list[int] = []
     counts, pairs, stereo = [], [], []
     others: list[list[Matches]] = [[], []]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fgslam.cameras.omni import OmniCamera, unit_rays
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray, thinned
 from fgslam.core.errors import (
     ConfigError,
     DatasetError,
@@ -39,7 +39,6 @@ from fgslam.report.content import (
     level_axes,
     read_table,
     records,
-    thinned,
     world_position_covariances,
 )
 from fgslam.report.formats import read_ply

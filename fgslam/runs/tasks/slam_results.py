@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.backend.self_calibration import SelfCalibration
 from fgslam.cameras.calib_json import write_corrected
 from fgslam.cameras.rectify import Rectifier
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, thinned
 from fgslam.core.correction import FIELD_PX, IMPLAUSIBLE_PX, term_names
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.files import make_subfolder, read_text, write_text
@@ -39,8 +39,8 @@ from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.report.content import (
     Column,
     TextTable,
+    metres,
     sentence,
-    thinned,
     write_csv,
     write_metrics,
     write_timing,
@@ -647,12 +647,12 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     bias, start = more.get("gyroscope_bias_dps"), more.get("end_against_start")
     end = "unknown"
     if metrics.end_error_m is not None and len(recorder) > 1:
-        end = f"{_metres(metrics.end_error_m)}, {_number('{:.3f} deg', metrics.end_error_deg)}"
+        end = f"{metres(metrics.end_error_m)}, {_number('{:.3f} deg', metrics.end_error_deg)}"
 
     def poses(count: object) -> str:
         return f", {count} poses" if count else ""
 
-    rpe = f"{_metres(metrics.rpe_trans_m)}, {_number('{:.3f} deg', metrics.rpe_rot_deg)}"
+    rpe = f"{metres(metrics.rpe_trans_m)}, {_number('{:.3f} deg', metrics.rpe_rot_deg)}"
     rows = {
         "frames": f"{len(recorder)} of {outputs.frames}",
         "located in the map": f"{outputs.located}" + f", {elsewhere} elsewhere" * (elsewhere > 0),
@@ -661,7 +661,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         "landmarks matched, median (5 %)": "none"
         if matches is None
         else f"{matches['median']:.0f} ({matches['p05']:.0f})",
-        "ATE rms, SE3 aligned": f"{_metres(metrics.ate_rmse_m)}{poses(more.get('matched_poses'))}",
+        "ATE rms, SE3 aligned": f"{metres(metrics.ate_rmse_m)}{poses(more.get('matched_poses'))}",
         "RPE a frame": f"{rpe}{poses(more.get('matched_poses'))}",
         "end error, first pose aligned": f"{end}{poses(more.get('judged_poses'))}",
         "end against start": "unknown",
@@ -698,12 +698,6 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
 
 def _number(text: str, value: float | None) -> str:
     return "unknown" if value is None else text.format(value)
-
-
-def _metres(value: float | None) -> str:
-    if value is None:
-        return "unknown"
-    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
 
 
 def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]:

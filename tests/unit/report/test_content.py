@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import thinned
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.evaluation.statistics import EstimatorMetrics, spread
 from fgslam.report.content import (
@@ -21,7 +22,6 @@ from fgslam.report.content import (
     peaks,
     read_metrics,
     read_table,
-    thinned,
     write_csv,
     write_json,
     write_metrics,

@@ -97,7 +97,7 @@ def test_sampling_reads_no_more_than_asked(tmp_path: Path) -> None:
         return recording.load_images(index, colour)
 
     assert check_images(replace(recording, load_images=counted), 5) == ()
-    assert read == [0, 9, 19, 29, 39]
+    assert read == [0, 10, 20, 29, 39]
 
 
 def test_same_camera_twice_and_unequal_brightness(tmp_path: Path) -> None:
