@@ -231,12 +231,11 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     online, *_, online_nees = path_numbers(
         answer.online, answer.online_covariances, estimate.online_relative
     )
-    distances, of_landmarks = np.empty(0), Nees(np.empty(0), np.empty(0, np.int64))
-    known = of_camera.trajectory
+    known, compared = of_camera.trajectory, None
     eTt = None if known is None else estimate_from_truth(estimate.trajectory, known)
-    compared = eTt is not None and truth.landmarks is not None
     if eTt is not None and truth.landmarks is not None:
-        distances, of_landmarks = landmark_errors(estimate.landmarks, truth.landmarks, eTt)
+        compared = landmark_errors(estimate.landmarks, truth.landmarks, eTt)
+    distances, of_landmarks = compared or (np.empty(0), Nees(np.empty(0), np.empty(0, np.int64)))
     judged = judge([of_landmarks])
     metrics = EstimatorMetrics(
         **{name: final.pop(name) for name in _OF_CONTRACT},
@@ -258,7 +257,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "online": online,
             "landmark_rmse_m": float(np.sqrt(np.mean(distances**2))) if len(distances) else None,
             "landmark_median_m": float(np.median(distances)) if len(distances) else None,
-            "landmarks_with_truth": len(distances) if compared else None,
+            "landmarks_with_truth": None if compared is None else len(distances),
             "landmark_truth_sigma_m": truth.landmark_sigma_m,
             **_innovations(answer),
             "update_growth": time_growth(answer.update_ms),
