@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, compose_odometry
+from fgslam.core.sensors import Odometry, PoseFrame, compose_odometry
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.recording import select_frames
@@ -27,7 +28,6 @@ from fgslam.worlds.lab import (
     Room,
     World,
     first_pose,
-    identity_values,
     make_rig,
     open_room,
     plan_in_place,
@@ -51,6 +51,16 @@ class RenderedLabSequence:
 
     The world frame of the ground truth is the reference camera's pose at the first frame of the
     drive; of random poses, at that of the place's own drive.
+
+    Attributes:
+        name: short name for titles.
+        rig: the exact calibration of the rendered cameras.
+        timestamps: (n,) seconds since the drive's first frame.
+        identity: SHA-256 of the seed, the renderer's version and all settings but which frames to
+            use: that of the whole recording, as those on disk have it, so that a run may go on.
+        notes: which effects are on.
+        room_from_world: (4, 4) from the trajectory's world to the room (origin on the floor, z up).
+        ground_truth: exact poses of the reference camera at the selected frames.
     """
 
     truth_frame: PoseFrame = "right"
@@ -81,65 +91,40 @@ class RenderedLabSequence:
         """
         self._settings = settings
         self._seed = seed
-        self._rig = make_rig(settings.rig)
+        self.rig = make_rig(settings.rig)
         self._place = PlaceChoice.of(settings)
-        self._drive = plan_in_place(self._place, settings.drive, self._rig)
+        self._drive = plan_in_place(self._place, settings.drive, self.rig)
         chosen = FrameSelection(start=start, stop=stop, stride=stride)
         self._indices = select_frames(len(self._drive.timestamps), chosen, "the drive")
         self._body = self._drive.body_poses(self._drive.timestamps)
-        self._world_body = self._body[0]
+        self.name = f"rendered {self._place.name}, {settings.drive.path.replace('_', ' ')}"
+        self.timestamps: FloatArray = self._drive.timestamps[self._indices]
+        effects = {
+            "person": settings.effects.person,
+            "blocked frames": settings.effects.blocked_frames,
+        }
+        self.notes = tuple(f"effect: {k}" for k, value in effects.items() if value is not None)
+        start_pose = self._body[0]
         if settings.drive.path == "random_poses":
-            self._world_body = first_pose(settings.place, settings.drive)
+            start_pose = first_pose(settings.place, settings.drive)
+        self.room_from_world: FloatArray = start_pose @ self.rig.bTc
+        poses = geometry.inverse(self.room_from_world) @ self.room_from_camera(self.timestamps)
+        self.ground_truth = Trajectory(self.timestamps, poses)
         self._odometry = simulate_wheels(
             settings.odometry, self._body, np.random.default_rng([seed, 1])
         )
-        self._walk = make_walk(settings, self._drive, self._rig)
+        self._walk = make_walk(settings, self._drive, self.rig)
         self._world: World | None = None
         self._world_lock = threading.Lock()
-        # Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed.
-        everything = identity_values(settings)
-        description = {key: everything[key] for key in _SHAPING_KEYS if key in everything} | {
-            "render_version": RENDER_VERSION,
-            "motion_blur": everything["effects"]["motion_blur"],
-            "person": everything["effects"]["person"],
-        }
-        shape = (self._rig.cameras, self._rig.height, self._rig.width)
+        # Exactly what shapes the clean images: neither noise, cover, odometry nor seed.
+        everything = asdict(settings)
+        description = {key: everything[key] for key in _SHAPING_KEYS}
+        description |= {"person": settings.effects.person, "render_version": RENDER_VERSION}
+        whole = {key: value for key, value in everything.items() if key not in _SELECTION}
+        self.identity = content_hash({"settings": whole, "seed": seed, "render": RENDER_VERSION})
+        shape = (self.rig.cameras, self.rig.height, self.rig.width)
         self._cache = RenderCache(content_hash(description), description, shape)
         self._render_missing(progress)
-
-    # ---------------------------------------------------------------- the Sequence protocol
-
-    @property
-    def name(self) -> str:
-        """Short name for titles."""
-        return f"rendered {self._place.name}, {self._settings.drive.path.replace('_', ' ')}"
-
-    @property
-    def rig(self) -> CameraRig:
-        """The exact calibration of the rendered cameras."""
-        return self._rig
-
-    @property
-    def timestamps(self) -> FloatArray:
-        """(n,) seconds since the drive's first frame."""
-        return self._drive.timestamps[self._indices]
-
-    @property
-    def identity(self) -> str:
-        """SHA-256 of the seed, the renderer's version and all settings but which frames to use.
-
-        So it is that of the whole recording, as those on disk have it: a run may go on with it.
-        """
-        settings = identity_values(self._settings)
-        settings = {name: value for name, value in settings.items() if name not in _SELECTION}
-        return content_hash({"settings": settings, "seed": self._seed, "render": RENDER_VERSION})
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Which effects are on."""
-        effects = self._settings.effects
-        known = {"person": effects.person, "blocked frames": effects.blocked_frames}
-        return tuple(f"effect: {name}" for name, value in known.items() if value is not None)
 
     def __len__(self) -> int:
         """Number of selected frames."""
@@ -173,22 +158,11 @@ class RenderedLabSequence:
             return None
         return compose_odometry(self._odometry[first:last])
 
-    @property
-    def ground_truth(self) -> Trajectory:
-        """Exact poses of the reference camera at the selected frames."""
-        poses = self.room_from_camera(self._drive.timestamps[self._indices])
-        return Trajectory(self.timestamps, geometry.inverse(self.room_from_world) @ poses)
-
     # ---------------------------------------------------------------- exact truth
-
-    @property
-    def room_from_world(self) -> FloatArray:
-        """(4, 4) from the trajectory's world to the room (origin on the floor, z up)."""
-        return np.asarray(self._world_body @ self._rig.bTc)
 
     def room_from_camera(self, seconds: FloatArray) -> FloatArray:
         """(n, 4, 4) poses of the reference camera in the room at any times of the drive."""
-        return np.asarray(self._drive.body_poses(np.atleast_1d(seconds)) @ self._rig.bTc)
+        return np.asarray(self._drive.body_poses(np.atleast_1d(seconds)) @ self.rig.bTc)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -209,9 +183,9 @@ class RenderedLabSequence:
     def _true_pixels(self, i: int, seen: Callable[..., Any], blocked: float) -> Any:
         index = self._index(i)
         if is_blocked(self._settings.effects, index):
-            return np.full((self._rig.height, self._rig.width), blocked)
+            return np.full((self.rig.height, self.rig.width), blocked)
         world = self._open_world()
-        return seen(world, self._body[index] @ self._rig.bTc, self._bodies(world, index))
+        return seen(world, self._body[index] @ self.rig.bTc, self._bodies(world, index))
 
     # ---------------------------------------------------------------- rendering
 
@@ -223,7 +197,7 @@ class RenderedLabSequence:
     def _open_world(self) -> World:
         with self._world_lock:
             if self._world is None:
-                self._world = World(self._rig, open_room(self._place))
+                self._world = World(self.rig, open_room(self._place))
                 self._require_clearance(self._world.room)
             return self._world
 
@@ -260,9 +234,9 @@ class RenderedLabSequence:
     def _render(self, index: int) -> Image:
         """Clean images (cameras, height, width) of one of the drive's frames."""
         world = self._open_world()
-        pose = self._body[index] @ self._rig.bTc
+        pose = self._body[index] @ self.rig.bTc
         bodies = self._bodies(world, index)
-        images = [world.image(pose @ offset, bodies) for offset in self._rig.camera_poses]
+        images = [world.image(pose @ offset, bodies) for offset in self.rig.camera_poses]
         return np.clip(np.rint(images), 0, 255).astype(np.uint8)
 
     def _bodies(self, world: World, index: int) -> list[Body]:

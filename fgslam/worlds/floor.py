@@ -247,40 +247,29 @@ class PathPlanner:
         largest = np.argmax(np.bincount(parts[free.ravel()]))
         self._shape, self._inside = free.shape, free.ravel() & (parts == largest)
 
-    def reference_path(
-        self,
-        spacing: float,
-        legs: int,
-        rng: np.random.Generator,
-        within: str | None = None,
-    ) -> FloatArray:
+    def reference_path(self, spacing: float, legs: int, rng: np.random.Generator) -> FloatArray:
         """(legs + 1, 3) poses, start first, each headed to the next one.
 
         Args:
             spacing: straight distance from each to the next, metres.
             legs: number of targets after the start.
             rng: chooses the tour and the targets.
-            within: name of the room to stay in; None tours the house.
 
         Raises:
             DatasetError: no such path is found.
         """
         for _ in range(_STARTS):
-            if within is not None:
-                names = [within] * 24
-            else:
-                first = int(rng.integers(0, len(_TOUR)))
-                names = [_TOUR[(first + k) % len(_TOUR)] for k in range(3 * len(_TOUR))]
-                if rng.random() < 0.5:
-                    names = names[::-1]
+            first = int(rng.integers(0, len(_TOUR)))
+            names = [_TOUR[(first + k) % len(_TOUR)] for k in range(3 * len(_TOUR))]
+            if rng.random() < 0.5:
+                names = names[::-1]
             tour = [self._spot(name, rng) for name in names]
-            points = self.walk(tour, spacing, legs, rng, within)
+            points = self.walk(tour, spacing, legs, rng)
             if points is not None:
                 return _with_headings(points)
-        where = "the house" if within is None else f"the {within}"
         raise DatasetError(
             f"no path of {legs} legs of {spacing} m with {self._clearance} m of clearance is found "
-            f"in {where}; lower path.spacing_m or path.legs"
+            "in the house; lower path.spacing_m or path.legs"
         )
 
     def crossing_routes(
@@ -312,7 +301,6 @@ class PathPlanner:
         spacing: float,
         legs: int | None,
         rng: np.random.Generator,
-        within: str | None = None,
     ) -> FloatArray | None:
         """(legs + 1, 2) places of a walk from the first of some free places (2,) by the others.
 
@@ -337,8 +325,6 @@ class PathPlanner:
             places = here + spacing * unit(angles)
             cost = way(goals[-1], places) + _CHANCE * rng.random(_DIRECTIONS)
             cost[~self._space.line_is_free(here, places, self._clearance)] = np.inf
-            if within is not None:
-                cost[[not _ROOMS[within].holds(float(x), float(y)) for x, y in places]] = np.inf
             if len(path) > 1:
                 step = here - path[-2]
                 turn = np.abs(wrap(angles - np.arctan2(step[1], step[0])))

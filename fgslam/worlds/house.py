@@ -152,9 +152,8 @@ class OmniWorld:
         self.calibration = miscalibrated(self.camera, settings.calibration, self._rng(8))
         self._renderer = Renderer(omni_view(self.camera), self.model.bank, _EDGE_CONTRAST)
         self._planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
-        within = None if settings.path.rooms == "house" else settings.path.rooms
         self.reference_poses = self._planner.reference_path(
-            settings.path.spacing_m, settings.path.legs, self._rng(0), within
+            settings.path.spacing_m, settings.path.legs, self._rng(0)
         )
         self._people = People(self._people_routes(), self._rng(1), self.model.bank)
         self._tilt = camera_tilt(settings.tilt_deg, self._rng(2))

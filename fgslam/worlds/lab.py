@@ -6,9 +6,8 @@ the light and the time law are the same everywhere.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from fgslam.core import geometry
 from fgslam.core.arrays import Float32, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds import driving
 from fgslam.worlds.driving import (
     Drive,
     PlanarPath,
@@ -27,9 +25,9 @@ from fgslam.worlds.driving import (
     round_corners,
     through_waypoints,
 )
-from fgslam.worlds.floor import BURST_STEP_M, RANDOM_CLEARANCE_M, FloorSpace, draw_poses
+from fgslam.worlds.floor import FloorSpace, draw_poses
 from fgslam.worlds.patches import RayCaster, stack
-from fgslam.worlds.people import ACROSS_M, WALK_FRAMES, Stance, person
+from fgslam.worlds.people import Stance, person
 from fgslam.worlds.places import (
     Place,
     build_corridors,
@@ -161,51 +159,6 @@ def first_pose(name: PlaceName, settings: LabDriveSettings) -> FloatArray:
     own = PATHS[name][0] if settings.path == "random_poses" else settings.path
     path = place_path(name, replace(settings, path=own))
     return np.asarray(planar_poses(np.array([[*path.xy[0], path.heading[0]]]))[0])
-
-
-def identity_values(settings: LabSettings) -> dict[str, Any]:
-    """Settings as plain values, with the constants that shape a recording of them.
-
-    By the names that they had when its identity and the name of its rendered frames were made:
-    so both stay what they are while settings become constants and other places come.
-    """
-    out, effects = asdict(settings), settings.effects
-    out["rig"] |= {
-        "horizontal_fov_deg": FIELD_OF_VIEW_DEG,
-        "ahead_m": AHEAD_M,
-        "aside_m": 0.0,
-        "above_m": ABOVE_M,
-        "tilt_deg": 0.0,
-    }
-    wheels = settings.odometry
-    out["odometry"] = {
-        "distance_scale": wheels.scale_error,
-        "turn_scale": wheels.scale_error,
-        "distance_m_sqrt_m": wheels.noise * driving.ALONG_M_SQRT_M,
-        "sideways_m_sqrt_m": wheels.noise * driving.SIDEWAYS_M_SQRT_M,
-        "yaw_deg_sqrt_m": wheels.noise * driving.YAW_DEG_SQRT_M,
-        "yaw_deg_sqrt_rad": wheels.noise * driving.YAW_DEG_SQRT_RAD,
-        "height_m_sqrt_m": driving.HEIGHT_M_SQRT_M,
-        "tilt_deg_sqrt_m": driving.TILT_DEG_SQRT_M,
-        "floor_m": driving.FLOOR_M,
-        "floor_deg": driving.FLOOR_DEG,
-    }
-    out["drive"]["frame_rate_hz"] = driving.FRAME_RATE_HZ
-    out["drive"]["max_acceleration_m_s2"] = driving.MAX_ACCELERATION_M_S2
-    out["drive"]["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
-    walk = {"first_frame": effects.person, "frames": WALK_FRAMES, "distance_m": ACROSS_M}
-    out["effects"] |= {
-        "exposure": None,
-        "motion_blur": None,
-        "person": None if effects.person is None else walk,
-    }
-    if settings.drive.path != "random_poses":
-        del out["drive"]["random_poses"]
-    if settings.place == "lab":
-        del out["place"]
-    if settings.posters == "different":
-        del out["posters"]
-    return out
 
 
 # --------------------------------------------------------------------------------------------

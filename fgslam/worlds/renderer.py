@@ -697,8 +697,6 @@ class RenderCache:
 
     def read(self, index: int) -> Image | None:
         """Images of one frame, or None where the file is absent, foreign, cut or damaged."""
-        if not self.present(index):
-            return None
         try:
             content = self.path(index).read_bytes()
         except OSError:

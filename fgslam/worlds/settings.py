@@ -178,9 +178,6 @@ class HousePathSettings:
 
     legs: Legs = Field(default=10, description="targets to reach one after another")
     spacing_m: Spacing = Field(default=3.0, description="between a target and the next, metres")
-    rooms: Literal["house", "hall"] = Field(
-        default="house", description="`house`: from room to room; `hall`: within the largest"
-    )
 
 
 @dataclass(frozen=True, config=STRICT)

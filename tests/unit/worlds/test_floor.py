@@ -39,12 +39,12 @@ def test_clearance_is_the_distance_to_a_box() -> None:
     ]
 
 
-@pytest.mark.parametrize(("spacing", "within"), [(2.0, None), (4.0, None), (2.0, "hall")])
-def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: str | None) -> None:
+@pytest.mark.parametrize("spacing", [2.0, 4.0])
+def test_reference_path_is_drivable(space: FloorSpace, spacing: float) -> None:
     planner = PathPlanner(space, 0.55)
     rooms = set()
     for seed in range(5):
-        poses = planner.reference_path(spacing, 10, rng(seed), within)
+        poses = planner.reference_path(spacing, 10, rng(seed))
         assert poses.shape == (11, 3)
         step = np.diff(poses[:, :2], axis=0)
         np.testing.assert_allclose(np.linalg.norm(step, axis=1), spacing)
@@ -53,16 +53,14 @@ def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: s
         part = np.linspace(0.0, 1.0, 25)[:, None]
         for start, move in zip(poses[:-1, :2], step, strict=True):
             assert space.clearance(start + part * move).min() > 0.52
-        names = {room.name for x, y, _ in poses for room in HOUSE.rooms if room.holds(x, y)}
-        assert within is None or names == {within}
-        rooms |= names
-    np.testing.assert_array_equal(poses, planner.reference_path(spacing, 10, rng(4), within))
-    assert within is not None or len(rooms) >= 4
+        rooms |= {room.name for x, y, _ in poses for room in HOUSE.rooms if room.holds(x, y)}
+    np.testing.assert_array_equal(poses, planner.reference_path(spacing, 10, rng(4)))
+    assert len(rooms) >= 4
 
 
 def test_impossible_path_is_refused(space: FloorSpace) -> None:
-    with pytest.raises(DatasetError, match=r"no path of 60 legs of 8\.0 m .* in the hall; lower"):
-        PathPlanner(space, 0.9).reference_path(8.0, 60, rng(), "hall")
+    with pytest.raises(DatasetError, match=r"no path of 60 legs of 19\.0 m .* in the house; lower"):
+        PathPlanner(space, 0.55).reference_path(19.0, 60, rng())
 
 
 def make_sensor(noise: float, patches: PatchArrays) -> RangeSensor:

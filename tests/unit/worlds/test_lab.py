@@ -211,9 +211,9 @@ def test_no_odometry_is_given_where_the_robot_was_carried() -> None:
 @pytest.mark.parametrize(
     ("settings", "key"),
     [
-        (LabSettings(), "23b8a10e304c4be44dc4"),
-        (RenderedLabSettings(start=3, stop=9, stride=2), "23b8a10e304c4be44dc4"),
-        (LabSettings(visit=2), "31858c82fd4d4a0de238"),
+        (LabSettings(), "418a16d402db4e1170ea"),
+        (RenderedLabSettings(start=3, stop=9, stride=2), "418a16d402db4e1170ea"),
+        (LabSettings(visit=2), "df6de2b8715b6bc84d72"),
     ],
     ids=["paper", "selection", "visit"],
 )
