@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.cameras.lenses import LENSES, Calibration, RawCamera, StatedView, checked_view
+from fgslam.cameras.lenses import LENSES, Calibration, RawCamera, View, checked_view
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.trees import (
     Row,
@@ -79,7 +79,7 @@ def read_own(path: Path, tree: Tree, _: Size | None) -> Calibration:
         size = stated.size("width", "height")
         if min(size) <= 0:
             raise stated.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
-        view = StatedView(tuple(rotations), stated.matrix("matrix", 3, 3), size)
+        view = View(stated.matrix("matrix", 3, 3), size, tuple(rotations))
         view = checked_view(view, str(path))
     sided = tree.get("sided") is True
     return Calibration(str(path), OWN_FORMAT, tuple(cameras), sided, view, corrections=corrections)
@@ -174,7 +174,7 @@ def as_calibrated(
         RawCamera(*size, matrix, np.zeros(4), rig.bTc @ pose(np.eye(3), np.array(at)), name)
         for name, at in offsets
     )
-    view = None if corrections is None else StatedView((np.eye(3),) * len(cameras), matrix, size)
+    view = None if corrections is None else View(matrix, size, (np.eye(3),) * len(cameras))
     return Calibration(str(path), OWN_FORMAT, cameras, True, view, corrections=corrections)
 
 

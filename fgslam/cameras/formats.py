@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.calib_json import OF_RECTIFIED, is_own, is_rectified, read_own
-from fgslam.cameras.lenses import Calibration, RawCamera, StatedView, checked_camera, checked_view
+from fgslam.cameras.lenses import Calibration, RawCamera, View, checked_camera, checked_view
 from fgslam.cameras.omni import read_ocamcalib
 from fgslam.cameras.trees import (
     BROWN,
@@ -273,7 +273,7 @@ def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) ->
         replace(right, bTc=pose(r_right, np.zeros(3))),
     )
     source = f"{files[0]} and {files[1].name}"
-    view = checked_view(StatedView((r_left, r_right), p_right[:, :3], left.size), source)
+    view = checked_view(View(p_right[:, :3], left.size, (r_left, r_right)), source)
     return Calibration(source, "ROS camera_info, a pair", cameras, True, view)
 
 
@@ -574,7 +574,7 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     if "LEFT.K" in part and "RIGHT.K" in part:  # with the rectification of both
         projection = part.matrix("RIGHT.P", 3, 4)
         turns = part.matrix("LEFT.R", 3, 3), part.matrix("RIGHT.R", 3, 3)
-        view = checked_view(StatedView(turns, projection[:, :3], size), str(path))
+        view = checked_view(View(projection[:, :3], size, turns), str(path))
         places = projection[0, 3] / projection[0, 0], 0.0
         pair = []
         for side, turn, x in zip(("LEFT", "RIGHT"), turns, places, strict=True):

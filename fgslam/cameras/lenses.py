@@ -457,7 +457,7 @@ def checked_camera(camera: RawCamera) -> RawCamera:
     return camera
 
 
-def checked_view(view: StatedView, source: str) -> StatedView:
+def checked_view(view: View, source: str) -> View:
     """The stated rectification itself.
 
     Raises:
@@ -525,18 +525,30 @@ def _camera_faults(camera: RawCamera) -> Iterator[str]:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class StatedView(Brief):
-    """The rectification that a file states.
+class View(Brief):
+    """The image plane of rectified images, and how cameras are turned into it.
 
     Attributes:
-        rotations: (3, 3) each, from raw to rectified axes, in the order of the file's cameras.
         matrix: (3, 3) intrinsics of all rectified images, pixels.
         size: width and height of the rectified images, pixels.
+        rotations: (3, 3) each, from raw to rectified axes, in the order of the cameras.
     """
 
-    rotations: tuple[FloatArray, ...]
     matrix: FloatArray
     size: tuple[int, int]
+    rotations: tuple[FloatArray, ...] = ()
+
+    @property
+    def angles(self) -> FloatArray:
+        """Horizontal and vertical angle of view (2,) in radians."""
+        ends = np.array([[-0.5, -0.5], [self.size[0] - 0.5, self.size[1] - 0.5]])
+        low, high = (ends - self.matrix[:2, 2]) / np.diag(self.matrix)[:2]
+        return np.asarray(np.arctan(high) - np.arctan(low))
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Rays (n, 3), of any length, along which pixels (n, 2) look."""
+        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+        return np.asarray(homogeneous @ np.linalg.inv(self.matrix).T)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -560,7 +572,7 @@ class Calibration(Brief):
     format: str
     cameras: tuple[RawCamera, ...]
     sided: bool = False
-    view: StatedView | None = None
+    view: View | None = None
     notes: tuple[str, ...] = field(default=())
     corrections: Mapping[str, float] | None = None
     guessed_lens: str = ""

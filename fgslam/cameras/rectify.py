@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.lenses import Calibration, RawCamera, View
 from fgslam.core.arrays import Brief, Float32, FloatArray, Image
 from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
@@ -127,26 +127,6 @@ class Rectifier(Brief):
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """An image plane: (3, 3) intrinsics in pixels, width and height."""
-
-    matrix: FloatArray
-    size: tuple[int, int]
-
-    @property
-    def angles(self) -> FloatArray:
-        """Horizontal and vertical angle of view (2,) in radians."""
-        ends = np.array([[-0.5, -0.5], [self.size[0] - 0.5, self.size[1] - 0.5]])
-        low, high = (ends - self.matrix[:2, 2]) / np.diag(self.matrix)[:2]
-        return np.asarray(np.arctan(high) - np.arctan(low))
-
-    def rays(self, pixels: FloatArray) -> FloatArray:
-        """Rays (n, 3), of any length, along which pixels (n, 2) look."""
-        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
-        return np.asarray(homogeneous @ np.linalg.inv(self.matrix).T)
-
-
 def orientation(positions: Sequence[FloatArray], axes: FloatArray) -> FloatArray:
     """Rotation (3, 3) from the body's axes to the view's.
 
@@ -193,7 +173,8 @@ def chosen_view(
         focal = size[0] / (high[0] - low[0])
     middle = 0.5 * (low + high)
     column, row = (0.5 * (np.array(size) - 1.0) - focal * middle).tolist()
-    return View(np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]]), size)
+    matrix = np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]])
+    return View(matrix, size, tuple(rotations))
 
 
 def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -240,7 +221,6 @@ def sampling_maps(
 
 def rectifier(
     cameras: Sequence[RawCamera],
-    rotations: Sequence[FloatArray],
     view: View,
     corrected: Callable[[CameraRig], FloatArray] | None = None,
 ) -> Rectifier:
@@ -248,14 +228,13 @@ def rectifier(
 
     Args:
         cameras: right, left[, top].
-        rotations: (3, 3) of each, from raw to the view's axes.
-        view: the common image plane.
+        view: the common image plane, with the turn of each of them.
         corrected: displacements (p,) of the rig's images, which are undone as well.
     """
     right = cameras[0]
     focal = np.diag(view.matrix)[:2]
     # The axes of the view in the body, by the reference camera.
-    axes = right.bTc[:3, :3] @ rotations[0].T
+    axes = right.bTc[:3, :3] @ view.rotations[0].T
     away = [axes.T @ (right.bTc[:3, 3] - camera.bTc[:3, 3]) for camera in cameras[1:]]
     above = float(away[1][1]) if len(away) > 1 else None
     fx, fy, cx, cy = (float(value) for value in (*focal, *view.matrix[:2, 2]))
@@ -264,7 +243,7 @@ def rectifier(
     correction = None if corrected is None else corrected(rig)
     maps = tuple(
         sampling_maps(camera, rotation, view, displaced_grid(rig, k, correction))
-        for k, (camera, rotation) in enumerate(zip(cameras, rotations, strict=True))
+        for k, (camera, rotation) in enumerate(zip(cameras, view.rotations, strict=True))
     )
     return Rectifier(rig, maps, (0, 1, 2), right.size, correction=correction)
 

@@ -26,10 +26,9 @@ from fgslam.cameras.calib_json import (
     stated_corrections,
 )
 from fgslam.cameras.formats import KNOWN
-from fgslam.cameras.lenses import Calibration, RawCamera, StatedView, checked_camera
+from fgslam.cameras.lenses import Calibration, RawCamera, View, checked_camera
 from fgslam.cameras.rectify import (
     Rectifier,
-    View,
     chosen_view,
     orientation,
     rectifier,
@@ -551,10 +550,10 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     sources, turn, notes = _pair(cameras) if len(cameras) == 2 else _three(cameras)
     chosen = tuple(cameras[k] for k in sources)
     _require_side_by_side(chosen, turn)
-    rotations, view, also = _view(calibration, chosen, sources, turn, fov_deg)
+    view, also = _view(calibration, chosen, sources, turn, fov_deg)
     values = calibration.corrections
     corrected = None if values is None else lambda rig: correction_values(source, values, rig)
-    found = rectifier(chosen, rotations, view, corrected)
+    found = rectifier(chosen, view, corrected)
     if not found.overlap:
         raise CalibrationError(
             f"{source}: no place of the rectified view is seen by all of "
@@ -562,9 +561,9 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
             "other (R, T_BS) and their principal points, or choose a view: dataset.fov_deg, --fov"
         )
     turns = [np.eye(3)] * len(cameras)
-    for k, rotation in zip(sources, rotations, strict=True):
+    for k, rotation in zip(sources, view.rotations, strict=True):
         turns[k] = rotation
-    stated = StatedView(tuple(turns), view.matrix, view.size)
+    stated = replace(view, rotations=tuple(turns))
     found = replace(found, calibration=replace(calibration, view=stated, corrections=None))
     remarks = (*calibration.notes, *notes, *also)
     if model := calibration.guessed_lens:
@@ -741,21 +740,21 @@ def _view(
     sources: tuple[int, ...],
     turn: FloatArray,
     fov_deg: float | None,
-) -> tuple[tuple[FloatArray, ...], View, tuple[str, ...]]:
-    """Rotation of each camera into the view, the view, and remarks."""
+) -> tuple[View, tuple[str, ...]]:
+    """The view, with the rotation of each camera into it, and remarks."""
     stated = calibration.view if fov_deg is None else None
-    if stated is not None and calibration.corrections is not None:
-        rotations = tuple(stated.rotations[k] for k in sources)
-        return rotations, View(stated.matrix, stated.size), ()
+    if stated is not None:
+        stated = replace(stated, rotations=tuple(stated.rotations[k] for k in sources))
+        if calibration.corrections is not None:
+            return stated, ()
     calibration.require_uncorrected("another view (fov_deg) is asked for")
     if fov_deg is None and _are_rectified(chosen, turn):
-        return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
+        return View(chosen[0].matrix, chosen[0].size, (np.eye(3),) * len(chosen)), ()
     notes: tuple[str, ...] = ()
     natural = float(np.mean([camera.focal_px for camera in chosen]))
     if stated is not None:
         if stated.matrix[0, 0] > _LEAST_STATED * natural:
-            rotations = tuple(stated.rotations[k] for k in sources)
-            return rotations, View(stated.matrix, stated.size), ()
+            return stated, ()
         notes = (
             f"the rectified focal length that the file states, {stated.matrix[0, 0]:.0f} px, would "
             f"shrink the images ({natural:.0f} px); another view is chosen",
@@ -774,7 +773,7 @@ def _view(
             f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
             f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
         )
-    return rotations, view, notes
+    return view, notes
 
 
 def _are_rectified(chosen: Sequence[RawCamera], turn: FloatArray) -> bool:

@@ -13,7 +13,7 @@ import yaml
 
 from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.formats import KALIBR
-from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
+from fgslam.cameras.lenses import Calibration, RawCamera, View
 from fgslam.cameras.rig import rig_of
 from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
@@ -143,7 +143,7 @@ def _write_ros(calibration: Calibration, path: Path, fov_deg: float | None) -> N
             )
         first, second = (rig.bTc[:3, :3].T @ camera.bTc[:3, :3] for camera in cameras)
         matrix = intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
-        view = StatedView((first, second), matrix, (rig.width, rig.height))
+        view = View(matrix, (rig.width, rig.height), (first, second))
     baseline = float(np.linalg.norm(calibration.offset(1, 0)[:3, 3]))
     files = {}
     for k, (camera, name) in enumerate(zip(cameras, ("left", "right"), strict=True)):
