@@ -174,8 +174,8 @@ def _terms(x: FloatArray, y: FloatArray) -> list[_Shift]:
     ]
 
 
-def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> FloatArray:
-    """Information (p, p) of a calibration taken to leave ``expected_px`` over the image.
+def prior_information(rig: CameraRig) -> FloatArray:
+    """Information (p, p) of a calibration taken to leave EXPECTED_PX over the image.
 
     As if a grid of displacements in every image had been measured as zero, with a noise for which
     the displacements predicted by the terms of images have this standard deviation in the mean.
@@ -185,7 +185,7 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
     for k in range(rig.cameras):  # the reference camera's own are those of all
         own = len(TERMS) * (k - 1) + np.arange(len(IMAGE_TERMS))
         at = own if k else len(out) - 1 - np.arange(len(COMMON))
-        out[np.ix_(at, at)] = _stated(unit[:, 2 * k : 2 * k + 2][..., at], expected_px)
+        out[np.ix_(at, at)] = _stated(unit[:, 2 * k : 2 * k + 2][..., at], EXPECTED_PX)
     return out
 
 
@@ -296,13 +296,6 @@ class RigCorrection(Brief):
         unit = displacements(self.rig, pixels[:, : self.rig.cameras])
         variance = np.einsum("kap,pq,kaq->ka", unit, self.covariance, unit)
         return unit @ self.values, np.sqrt(variance)
-
-    def centre_px(self) -> tuple[float, float]:
-        """Disparity offset of a point in the middle of both images, pixels, and its sigma."""
-        rig = self.rig
-        middle = np.broadcast_to([rig.cx, rig.cy], (1, rig.cameras, 2))
-        moved, sigma = self.at(middle)
-        return float(moved[0, 2]), float(sigma[0, 2])
 
     @property
     def sigmas(self) -> FloatArray:

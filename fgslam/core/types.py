@@ -595,17 +595,12 @@ class EgoMotion(Brief):
         """Whether most of what was matched was used; a pose that was not measured uses nothing."""
         return not self.status.measured or 2 * int(self.inliers.sum()) >= len(self.inliers)
 
-    @property
-    def correlation(self) -> FloatArray:
-        """(6, 6) correlations of the pose, [rotation, translation]; 0 where motion is excluded.
-
-        The known one is that of sideways motion and yaw (Se et al. 5).
-        """
-        return correlation(self.covariance)
-
 
 def correlation(covariance: FloatArray) -> FloatArray:
-    """Correlations (..., n, n) of covariances (..., n, n); 0 for what has no variance."""
+    """Correlations (..., n, n) of covariances (..., n, n); 0 for what has no variance.
+
+    Of a pose's the known one is that of sideways motion and yaw (Se et al. 5).
+    """
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
     return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])

@@ -266,10 +266,6 @@ class OmniWorld:
         """(n, 3) what pixels (n, 2) show from an untilted pose (3,); NaN outside the field."""
         return surface_points(self.model.layer, self.camera, self._untilted(pose), pixels)
 
-    def ranges(self, pose: FloatArray) -> FloatArray:
-        """(h, w) distance from the viewpoint in metres, from an untilted pose (3,)."""
-        return self._renderer.distances(self.model.layer, self._untilted(pose))
-
     def _untilted(self, pose: FloatArray) -> FloatArray:
         return camera_pose(pose, CAMERA_HEIGHT_M, np.zeros(2))
 

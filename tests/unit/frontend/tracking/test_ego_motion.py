@@ -15,7 +15,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig, Observations
-from fgslam.core.types import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
+from fgslam.core.types import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, correlation
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
@@ -402,9 +402,10 @@ def test_correlation_of_a_pose() -> None:
         found = solve(scene(FORWARD, rng), FORWARD, change(dof=dof))
         sigma = np.sqrt(np.diag(found.covariance))
         free = sigma > 0
-        np.testing.assert_allclose(np.diag(found.correlation)[free], 1.0, atol=1e-12)
-        assert not found.correlation[~free].any()
-        assert found.correlation[1, 3] * sigma[1] * sigma[3] == pytest.approx(
+        shares = correlation(found.covariance)
+        np.testing.assert_allclose(np.diag(shares)[free], 1.0, atol=1e-12)
+        assert not shares[~free].any()
+        assert shares[1, 3] * sigma[1] * sigma[3] == pytest.approx(
             found.covariance[1, 3], rel=1e-12
         )
 
