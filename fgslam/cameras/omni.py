@@ -17,6 +17,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from fgslam.cameras.lenses import RawCamera, checked_camera
+from fgslam.cameras.trees import Values
 from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.files import read_text
@@ -680,57 +681,63 @@ def read_ocamcalib(path: Path) -> tuple[RawCamera, tuple[float, float] | None, t
         values, _, after = line.replace("%", "#").partition("#")  # MATLAB's comments, too
         words = values.replace(",", " ").split()
         if words:
-            entries.append((f"{path}, line {number}", comment, words))
+            entries.append((f"line {number}: ", comment, words))
         comment = "" if words else after.strip(" \t#") or comment
     if len(entries) < 5:
         raise CalibrationError(
             f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "
             "centre, affine parameters, size): export it again"
         )
+    names = ("direct polynomial", "inverse polynomial")
+    names = (*names, "centre (row, column)", "affine parameters (c, d, e)", "size (height, width)")
+    direct, inverse, centre, affine, size = (
+        Values(path, {name: words}, where)
+        for name, (where, _, words) in zip(names, entries, strict=False)
+    )
     polynomials = []
-    for which, (where, _, words) in zip(("direct", "inverse"), entries[:2], strict=True):
-        count, *terms = _numbers(f"{where}: {which} polynomial", words)
+    for part, name in zip((direct, inverse), names, strict=False):
+        count, *terms = part.numbers(name)
         if count != len(terms) or not 2 <= count <= _MAX_TERMS:
-            raise CalibrationError(
-                f"{where}: {which} polynomial: states {count:g} coefficients (2 to {_MAX_TERMS}) "
-                f"and has {len(terms)}; correct the line"
+            raise part.refuse(
+                f"{name}: states {count:g} coefficients (2 to {_MAX_TERMS}) and has {len(terms)}; "
+                "correct the line"
             )
         polynomials.append(np.array(terms))
-    direct, inverse = polynomials
-    (at_centre, _, centre), (at_affine, _, affine), (at_size, _, size), *extras = entries[2:]
-    row, column = _numbers(f"{at_centre}: centre (row, column)", centre, 2)
-    c, d, e = _numbers(f"{at_affine}: affine parameters (c, d, e)", affine, 3)
+    row, column = centre.numbers(names[2], 2)
+    c, d, e = affine.numbers(names[3], 3)
     if not c - d * e > 0.0:
-        raise CalibrationError(f"{at_affine}: affine parameters: c - d e > 0 is needed")
-    height, width = _wholes(f"{at_size}: size (height, width)", size)
-    require_size(f"{at_size}: size", width, height)
+        raise affine.refuse("affine parameters: c - d e > 0 is needed")
+    height, width = _wholes(size, names[4])
+    require_size(f"{path}: {size.where}size", width, height)
     ring: tuple[float, float] | None = None
     cropped = (0, 0)
-    for where, comment, words in extras:
+    for where, comment, words in entries[len(names) :]:
+        part = Values(path, {"ring": words, "cropped columns": words}, where)
         if "roi" in comment.lower() and "radius" in comment.lower():
-            outer, inner = _numbers(f"{where}: ring (largest, smallest radius)", words, 2)
+            outer, inner = part.numbers("ring", 2).tolist()
             if not 0.0 <= inner < outer:
-                raise CalibrationError(
-                    f"{where}: ring: largest radius {outer:g}, smallest {inner:g}; correct them"
+                raise part.refuse(
+                    f"ring: largest radius {outer:g}, smallest {inner:g}; correct them"
                 )
             ring = inner, outer
         elif "crop" in comment.lower():
-            cropped = _wholes(f"{where}: cropped columns (left, right)", words)
+            cropped = _wholes(part, "cropped columns")
         else:
-            raise CalibrationError(
-                f"{where}: an entry that is not known ({comment or 'without a comment'}); remove it"
+            raise part.refuse(
+                f"an entry that is not known ({comment or 'without a comment'}); remove it"
             )
     # Rows and columns from the centre, (x, y), are seen at (c x + d y, e x + y).
     matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
-    raw = RawCamera(width, height, matrix, direct, np.eye(4), str(path), "ocam")
+    direct_terms, inverse_terms = polynomials
+    raw = RawCamera(width, height, matrix, direct_terms, np.eye(4), str(path), "ocam")
     checked_camera(raw)
     try:
         camera = LensCamera.of(raw, ring, up=False)
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
     radius = np.linspace(*camera.ring, 200)
-    angle = np.arctan2(polynomial.polyval(radius, direct), radius)
-    apart = float(np.abs(polynomial.polyval(angle, inverse) - radius).max())
+    angle = np.arctan2(polynomial.polyval(radius, direct_terms), radius)
+    apart = float(np.abs(polynomial.polyval(angle, inverse_terms) - radius).max())
     if not apart <= _MAX_DISAGREEMENT_PX:
         raise CalibrationError(
             f"{path}: the inverse polynomial is {apart:.3g} px off the direct one, at most "
@@ -739,26 +746,10 @@ def read_ocamcalib(path: Path) -> tuple[RawCamera, tuple[float, float] | None, t
     return raw, ring, cropped
 
 
-def _numbers(where: str, words: list[str], count: int | None = None) -> tuple[float, ...]:
-    values = []
-    for word in words:
-        try:
-            values.append(float(word))
-        except ValueError:
-            values.append(math.nan)
-        if not math.isfinite(values[-1]):
-            raise CalibrationError(f"{where}: {word!r} is no finite number; correct it")
-    if count not in (None, len(values)):
-        raise CalibrationError(
-            f"{where}: {len(values)} numbers, expected {count}; correct the line"
+def _wholes(part: Values, name: str) -> tuple[int, int]:
+    found = part.numbers(name, 2)
+    if (found != np.rint(found)).any() or (found < 0.0).any():
+        raise part.refuse(
+            f"{name}: {found.tolist()}, not whole numbers of pixels; correct the line"
         )
-    return tuple(values)
-
-
-def _wholes(where: str, words: list[str]) -> tuple[int, int]:
-    first, second = _numbers(where, words, 2)
-    if first != int(first) or second != int(second) or first < 0 or second < 0:
-        raise CalibrationError(
-            f"{where}: {first:g} and {second:g}, expected whole numbers of pixels; correct the line"
-        )
-    return int(first), int(second)
+    return int(found[0]), int(found[1])
