@@ -688,8 +688,10 @@ def read_ocamcalib(path: Path) -> tuple[RawCamera, tuple[float, float] | None, t
             f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "
             "centre, affine parameters, size): export it again"
         )
-    names = ("direct polynomial", "inverse polynomial")
-    names = (*names, "centre (row, column)", "affine parameters (c, d, e)", "size (height, width)")
+    names = (
+        *("direct polynomial", "inverse polynomial"),
+        *("centre (row, column)", "affine parameters (c, d, e)", "size (height, width)"),
+    )
     direct, inverse, centre, affine, size = (
         Values(path, {name: words}, where)
         for name, (where, _, words) in zip(names, entries, strict=False)
