@@ -87,7 +87,7 @@ class FrameDescriber:
         """
         self._extract = extract
         self._reference_only = reference_only
-        self._pool: ThreadPoolExecutor | None = None
+        self._pool = ThreadPoolExecutor(len(CAMERA_NAMES))
         self._reference: tuple[Frame, _Timed] | None = None
 
     def describe(self, i: int, frame: Frame | None) -> FeatureFrame:
@@ -104,8 +104,6 @@ class FrameDescriber:
             return replace(found, features=(features,), sift_ms=ms)
         if self._reference_only:
             return self.of_reference(found)
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(len(frame.images))
         timed, known = partial(_timed, self._extract), self._known(frame)
         views = list(_views(frame))[len(known) :]
         tasks = [*known, *(self._pool.submit(timed, *view) for view in views)]
@@ -122,14 +120,19 @@ class FrameDescriber:
         ((features, ms),) = (known.result() for known in self._known(found.frame))
         return replace(found, features=(features,), sift_ms=ms)
 
+    def begin(self, frame: Frame | None) -> None:
+        """Starts to find, in a thread, the features that :meth:`of_reference` gives of a frame."""
+        if frame is not None and frame.alone is None:
+            view = next(iter(_views(frame)))
+            self._reference = frame, self._pool.submit(_timed, self._extract, *view)
+
     def _known(self, frame: Frame) -> list[_Timed]:
         """The features of a frame's reference image, where no other was asked for since."""
         return [self._reference[1]] if self._reference and self._reference[0] is frame else []
 
     def close(self) -> None:
         """Ends the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._pool.shutdown()
 
 
 def undescribed(i: int, frame: Frame | None) -> FeatureFrame:
@@ -153,12 +156,17 @@ class FeatureStream:
         self._sequence = sequence
         self._extract = extract
         self._images = 1 if reference_only else None
+        self._found: deque[_Pending] = deque()  # loaded, to come next
+
+    def upcoming(self) -> Frame | None:
+        """Images of the frame after the one that came last; None where there are none."""
+        return self._found[0].frame if self._found else None
 
     def __call__(self, start: int = 0) -> Generator[FeatureFrame, None, None]:
         """Yields frames ``start`` and after; stops its threads when closed."""
         pool = ThreadPoolExecutor(os.cpu_count() or 1)
         waiting: deque[tuple[int, Future[tuple[Frame | None, str, float]]]] = deque()
-        found: deque[_Pending] = deque()
+        self._found = found = deque[_Pending]()
         upcoming = iter(range(start, len(self._sequence)))
         try:
             while True:

@@ -69,6 +69,8 @@ class SlamPipeline:
             those of its reference image alone.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
+        look_ahead: called before the estimator's work where the next frame is likely to need
+            features; None where they cannot be found meanwhile.
         rewound: the last frame's features could not be found, and it was rolled back; but what a
             closure before it ended has ended.
         watch_of_frame: time of the last frame, by stage.
@@ -86,6 +88,7 @@ class SlamPipeline:
     located: Prediction | None = None
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
+    look_ahead: Callable[[], None] | None = None
     rewound: bool = False
     watch_of_frame: Stopwatch = field(default_factory=Stopwatch, init=False)
     witnesses: Witnesses = field(init=False)
@@ -134,6 +137,8 @@ class SlamPipeline:
             every, matched = self._track(now._replace(features=every), frame, carried)
             stereo = features = every.whole
             matched = self._recognise_places(matched, stereo, landmarks)
+        if self.look_ahead is not None and self.key_frames and self.key_frames.nears_end:
+            self.look_ahead()
         matched = self._end_landmarks(matched)
         increment = self._increment(index, timestamp, matched, measured)  # what the log holds
         stats, noise = self._update(increment, matched.ego_motion)  # 6.4

@@ -8,6 +8,7 @@ enters a map: :mod:`fgslam.runs.tasks.slam_map_entry`. Files and numbers:
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -169,7 +170,10 @@ def _loop(
     sequence, recorder, session = outputs.sequence, outputs.recorder, outputs.session
     output, frontend = outputs.config.output, outputs.config.frontend
     shown = frames_to_show(len(sequence)) if output.pictures else frozenset()
-    stream = make_stream(sequence, frontend, frontend.tracking == "sift")(start=len(recorder))
+    frames = make_stream(sequence, frontend, frontend.tracking == "sift")
+    stream = frames(start=len(recorder))
+    if len(os.sched_getaffinity(0)) > 1:
+        outputs.pipeline.look_ahead = lambda: session.describer.begin(frames.upcoming())
     waiting = time.perf_counter()
     interval, saved = output.checkpoint_seconds, waiting
     try:

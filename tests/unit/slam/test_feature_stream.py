@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -30,4 +32,24 @@ def test_features_reach_three_scales_around(hidden: int, kept: list[int]) -> Non
     np.testing.assert_array_equal(left.xy, PLACES)
     whole = describer.describe(0, Frame(0, 0.0, (image, image))).features
     assert [len(found) for found in whole] == [3, 3]
+    describer.close()
+
+
+def test_features_that_were_begun_are_found_once_and_in_a_thread() -> None:
+    threads: list[int] = []
+
+    def noted(image: Image) -> Features:
+        threads.append(threading.get_ident())
+        return three(image)
+
+    frame = Frame(0, 0.0, (np.zeros((20, 40), np.uint8),) * 2)
+    describer = FrameDescriber(noted, reference_only=True)
+    describer.begin(None)
+    describer.begin(frame)
+    (found,) = describer.describe(0, frame).features
+    np.testing.assert_array_equal(found.xy, PLACES)
+    (thread,) = threads
+    assert thread != threading.get_ident()
+    describer.describe(1, Frame(1, 0.1, frame.images))
+    assert threads[1:] == [threading.get_ident()]
     describer.close()

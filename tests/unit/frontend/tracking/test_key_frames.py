@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -374,3 +375,41 @@ def test_many_that_contradict_the_pose_ask_for_a_key_frame(outliers: int, lastin
     tracked: Any = SimpleNamespace(ego_motion=pose)
     tracker = KeyFrameTracker(SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
     assert tracker.lasts(carried, tracked, np.zeros((100, 100), np.uint8)) is lasting
+
+
+@pytest.mark.parametrize(
+    ("left", "likely"),
+    [([], False), ([90], False), ([90, 70], False), ([70, 52], True), ([60], True)],
+)
+def test_a_key_frame_is_expected_where_as_large_a_share_is_lost_again(
+    left: list[int], likely: bool
+) -> None:
+    """Of 100 landmarks 40 must be left: 70 and 52 make 39, 90 and 70 make 54."""
+    key_frames, key_frame = tracking_of_a_wall()
+    key_frame()
+    for count in left:
+        key_frames.record(
+            replace(frame(count, 0), carried=SimpleNamespace(ids=np.arange(count), features=None))
+        )
+    assert key_frames.nears_end is likely
+
+
+def test_after_two_key_frames_in_a_row_another_is_expected() -> None:
+    key_frames, key_frame = tracking_of_a_wall()
+    key_frame()
+    key_frame()
+    assert key_frames.nears_end
+
+
+def tracking_of_a_wall() -> tuple[KeyFrameTracker, Callable[[], None]]:
+    """A tracker that a frame has left a hundred landmarks, and what makes a key frame of them."""
+    image = pictures(HERE)[0]
+    database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)
+    tracker: Any = SimpleNamespace(database=database, associate_carried=lambda *_: None)
+    key_frames = KeyFrameTracker(
+        tracker, LandmarkCarrier(RIG, StereoMatcher(RIG, StereoSettings(), AppearanceSettings()))
+    )
+    seen = seen_at([(60.0 + k, 50.0 + k % 60) for k in range(100)], 2.0)
+    ids = database.add(seen, np.arange(100), np.zeros(100, np.uint8))
+    key_frames.record(replace(frame(100, 0), carried=SimpleNamespace(ids=ids, features=None)))
+    return key_frames, lambda: key_frames.begin(image, seen, association(seen, ids, is_new=True))
