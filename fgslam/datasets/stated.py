@@ -89,13 +89,14 @@ def read_stated(source: str | Path, covariance: Path | None = None) -> StatedPos
     """
     path, _, topic = str(source).partition(":/")
     if is_bag(Path(path)) or Path(path, "metadata.yaml").is_file():
-        found = _of_bag(Path(path), topic and f"/{topic}")
+        found = _of_bag(Path(path), topic and f"/{topic}", own=covariance is None)
     else:
-        found = _of_text(Path(source))
+        found = _of_text(Path(source), own=covariance is None)
     return found if covariance is None else _joined(found, Path(source), covariance)
 
 
-def _of_text(path: Path) -> StatedPoses:
+def _of_text(path: Path, own: bool) -> StatedPoses:
+    """Poses, and with their ``own`` covariances where the file has some."""
     table, head = _numbers(path, (_POSE, _EUROC, *(_POSE + n for n in _SIZES)), _POSES)
     values = table.values
     bad = np.flatnonzero(~np.isfinite(values[:, :_POSE]).all(axis=1))
@@ -110,9 +111,10 @@ def _of_text(path: Path) -> StatedPoses:
     poses = poses_of(table, values[:, 1:4], values[:, [5, 6, 7, 4] if w_first else [4, 5, 6, 7]])
     frame = re.search(r"pose of the (left|right|body)", head)
     trajectory = Trajectory(times, poses, frame[1] if frame else "right")  # type: ignore[arg-type]
-    covariances = None if values.shape[1] in (_POSE, _EUROC) else _matrices(table, _POSE)
+    stated = own and values.shape[1] not in (_POSE, _EUROC)
+    covariances = _matrices(table, _POSE) if stated else None
     notes = () if seconds == 1.0 else (f"times of {path} are read as {unit}",)
-    words = _words(head) if covariances is not None else frozenset()
+    words = _words(head) if stated else frozenset()
     return StatedPoses(trajectory, covariances, words, "", frame is not None, notes)
 
 
@@ -199,7 +201,7 @@ def _checked(matrices: FloatArray, path: Path, places: IntArray, place: str) -> 
     return np.where(known[:, None, None], even, np.nan)
 
 
-def _of_bag(path: Path, topic: str) -> StatedPoses:
+def _of_bag(path: Path, topic: str, own: bool) -> StatedPoses:
     from fgslam.datasets.bags import Bag, paths_of  # rosbags and OpenCV
 
     bag = Bag(paths_of(path))
@@ -225,7 +227,7 @@ def _of_bag(path: Path, topic: str) -> StatedPoses:
     table = Table(Path(f"{path}:{chosen[0].name}, messages"), values, numbers)
     require_increasing(table, values[:, 0])
     trajectory = Trajectory(values[:, 0], poses_of(table, values[:, 1:4], values[:, 4:]))
-    if chosen[0].kind not in _STATED:
+    if not own or chosen[0].kind not in _STATED:
         return StatedPoses(trajectory)
     stated = _checked(np.reshape(matrices, (-1, 6, 6)), table.path, numbers, "message")
     return StatedPoses(

@@ -1,0 +1,520 @@
+"""Messages about recordings, calibrations and judged files, and what follows their advice."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from advice import Advice
+from bags import camera_info, odometry, raw_image, stereo, write_bag
+from dataset_builders import (
+    EUROC_SIZE,
+    HEIGHT,
+    PERIOD_NS,
+    START_NS,
+    WIDTH,
+    euroc,
+    image_folder,
+    kitti,
+    loose,
+    picture,
+    save,
+    write_calibration,
+)
+from running import main
+from scipy.spatial.transform import Rotation
+
+from fgslam.core.geometry import pose
+
+APART = pose(np.eye(3), np.array([0.2, 0.0, 0.0]))
+
+
+def depth(root: Path, units: int = 2000, list_: bool = False, chain: bool = False) -> Path:
+    """Counters as names; 2000 units may be millimetres."""
+    for k in range(3):
+        save(root / "rgb" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+        save(root / "depth" / f"{k}.png", np.full((HEIGHT, WIDTH), units, np.uint16))
+    if list_:
+        rows = (f"{k} rgb/{k}.png {k} depth/{k}.png\n" for k in range(3))
+        (root / "associations.txt").write_text("".join(rows), encoding="utf-8")
+    if chain:
+        write_chain(root, 2, (30.0, 33.0))
+    else:
+        write_calibration(root)
+    return root
+
+
+def write_chain(root: Path, cameras: int, focal: tuple[float, ...]) -> None:
+    step = {"T_cn_cnm1": np.linalg.inv(APART).tolist()}
+    values = {
+        f"cam{k}": {
+            "camera_model": "pinhole",
+            "distortion_model": "none",
+            "intrinsics": [focal[k % len(focal)]] * 2 + [15.5, 11.5],
+            "resolution": [WIDTH, HEIGHT],
+            **(step if k else {}),
+        }
+        for k in range(cameras)
+    }
+    (root / "camchain.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+
+
+def pairs(root: Path, **changes: Any) -> Path:
+    loose(root, lambda k: (f"left/{k}.png", f"right/{k}.png"))
+    write_calibration(root, **changes)
+    return root
+
+
+def times_of_two(root: Path) -> Path:
+    loose(root, lambda k: (f"cam0/{k}.png", f"cam1/{k}.png"))
+    (root / "times.txt").write_text("0.0\n0.1\n", encoding="utf-8")
+    return root
+
+
+def without(name: str) -> Callable[[Path], object]:
+    return lambda root: (root / name).unlink()
+
+
+def opencv(root: Path, **changes: Any) -> Path:
+    matrix = [[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]]
+    values: dict[str, Any] = {"R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0], **changes}
+    values |= {f"{n}{k}": matrix for k in (1, 2) for n in "K"}
+    values |= {f"D{k}": [0.01, 0.01, 0.0, 0.0] for k in (1, 2)}
+    (root / "rig.json").write_text(json.dumps(values), encoding="utf-8")
+    return root / "rig.json"
+
+
+def guessed_lens(root: Path) -> Path:
+    pairs(root)
+    opencv(root).rename(root / "calib.json")
+    return root
+
+
+def bag(root: Path, written: Any) -> Path:
+    write_calibration(root)
+    return write_bag(root / "drive.bag", written)
+
+
+def uncalibrated(root: Path) -> Path:
+    return bag(root, [each for each in stereo() if not each[0].endswith("camera_info")])
+
+
+def both_views(root: Path) -> Path:
+    shown = [np.hstack([picture(60 + k), picture(10 + k)]) for k in range(3)]
+    kind = "sensor_msgs/msg/Image"
+    stamps = [START_NS + k * PERIOD_NS for k in range(3)]
+    messages = [
+        ("/usb/image_raw", s, kind, raw_image(i)) for s, i in zip(stamps, shown, strict=True)
+    ]
+    return bag(root, messages)
+
+
+def unsided(root: Path) -> Path:
+    return bag(root, stereo(names=("/front_eye", "/other_eye")))
+
+
+def two_pairs(root: Path) -> Path:
+    return bag(root, stereo() + stereo(names=("/rear/left", "/rear/right")))
+
+
+def driven(root: Path, topic: str) -> Path:
+    stamps = [START_NS + k * PERIOD_NS for k in range(4)]
+    poses = np.column_stack([0.1 * np.arange(4), np.zeros((4, 3))])
+    return bag(root, stereo() + odometry(stamps, poses, topic))
+
+
+def uncalibrated_euroc(root: Path) -> Path:
+    euroc(root, (np.eye(4), APART))
+    for path in root.glob("mav0/cam*/sensor.yaml"):
+        path.unlink()
+    width, height = EUROC_SIZE
+    write_calibration(root, width=width, height=height, cx=31.5, cy=23.5)
+    (root / "calib.json").rename(root / "mine.json")
+    return root
+
+
+def late_odometry(root: Path) -> Path:
+    image_folder(root)
+    rows = "".join(f"{1000.0 + 0.1 * k},1.0,0.0\n" for k in range(7))
+    (root / "odom.csv").write_text(rows, encoding="utf-8")
+    return root
+
+
+def two_layouts(root: Path) -> Path:
+    depth(root)
+    for side in ("left", "right"):
+        for k in range(3):
+            save(root / side / f"{k}.png", picture(k + (60 if side == "left" else 10)))
+    return root
+
+
+def converted(root: Path) -> Path:
+    (root / "out.yaml").write_text("mine", encoding="utf-8")
+    write_calibration(root)
+    return root / "calib.json"
+
+
+def four_cameras(root: Path) -> Path:
+    write_chain(root, 4, (30.0,))
+    return root / "camchain.yaml"
+
+
+def kitti_drive(root: Path) -> Path:
+    kitti(root)
+    write_calibration(root)
+    return root
+
+
+def stills(root: Path) -> Path:
+    for k in range(3):
+        save(root / f"{k}.png", np.hstack([picture(60 + k), picture(10 + k)]))
+    write_calibration(root)
+    return moved(root, "half.json")
+
+
+def moved(root: Path, name: str) -> Path:
+    (root / "calib.json").rename(root.parent / name)
+    return root
+
+
+def unrectified(root: Path) -> Path:
+    write_chain(root.parent, 2, (30.0,))
+    return pairs(root, rectified=False)
+
+
+def larger_colour(root: Path) -> Path:
+    depth(root)
+    for k in range(3):
+        save(root / "rgb" / f"{k}.png", np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8))
+    write_calibration(root, width=2 * WIDTH, height=2 * HEIGHT, fx=60.0, fy=62.0, cx=31.5, cy=23.5)
+    return root
+
+
+def smaller_colour(root: Path) -> None:
+    for k in range(3):
+        save(root / "rgb" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+
+
+def truthless(root: Path) -> Path:
+    return image_folder(root)
+
+
+def absent_recording(root: Path) -> Path:
+    image_folder(root / "here")
+    values = {"name": "x", "dataset": {"kind": "image_folder", "path": str(root / "gone")}}
+    (root / "x.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return root / "x.yaml"
+
+
+def three_topics(root: Path) -> Path:
+    write_chain(root, 3, (30.0,))
+    return bag(root, stereo() + stereo(names=("/rear/left", "/rear/right")))
+
+
+def zero_info(root: Path) -> Path:
+    none = {"k": np.zeros(9), "p": np.zeros(12)}
+    made = [
+        (topic, stamp, kind, {**fields, **none} if topic.endswith("camera_info") else fields)
+        for topic, stamp, kind, fields in stereo()
+    ]
+    return bag(root, made)
+
+
+def without_baseline(root: Path) -> Path:
+    none = {"p": np.zeros(12)}
+    made = [
+        (topic, stamp, kind, {**fields, **none} if topic.endswith("camera_info") else fields)
+        for topic, stamp, kind, fields in stereo()
+    ]
+    return bag(root, made)
+
+
+def four_in_a_bag(root: Path) -> Path:
+    write_chain(root, 4, (30.0,))
+    return bag(root, stereo())
+
+
+def right_one_first(root: Path) -> Path:
+    write_chain(root, 2, (30.0,))
+    values = yaml.safe_load((root / "camchain.yaml").read_text(encoding="utf-8"))
+    values["cam1"]["T_cn_cnm1"] = APART.tolist()
+    (root / "camchain.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return root / "camchain.yaml"
+
+
+def poses_file(root: Path, name: str = "poses.tum", covariances: bool = False) -> Path:
+    """Poses that are off by as much as their covariances state; the truth has no error."""
+    rng, count = np.random.default_rng(0), 60
+    path, error = (
+        np.cumsum(rng.standard_normal((count, 3)), axis=0),
+        rng.standard_normal((count, 6)),
+    )
+    error *= 0.0 if name.startswith("truth") else 0.01
+    turns = Rotation.from_rotvec(0.1 * path + error[:, :3]).as_quat()
+    rows = [0.1 * np.arange(count)[:, None], path + error[:, 3:], turns]
+    if covariances:
+        rows.append(np.tile(np.eye(6)[np.triu_indices(6)] * 1e-4, (count, 1)))
+    np.savetxt(root / name, np.column_stack(rows), fmt="%.9f")
+    return root / name
+
+
+def with_truth(root: Path, covariances: bool = False) -> Path:
+    poses_file(root, "truth.tum")
+    return poses_file(root, covariances=covariances)
+
+
+def covariances_of(root: Path) -> None:
+    upper = np.eye(6)[np.triu_indices(6)] * 1e-4
+    np.savetxt(root / "covariances.txt", np.tile(upper, (60, 1)), fmt="%.9f")
+
+
+def depth_bag(root: Path, frames: tuple[str, str] = ("", ""), infos: bool = True) -> Path:
+    """Colour, depth of 2 m in another frame perhaps, and a second colour camera."""
+    written: list[Any] = []
+    for k in range(3):
+        stamp = START_NS + k * PERIOD_NS
+        colour = raw_image(np.dstack([picture(10 + k)] * 3), "bgr8")
+        metres = raw_image(np.full((HEIGHT, WIDTH), 2000, np.uint16), "16UC1")
+        kind = "sensor_msgs/msg/Image"
+        written += [
+            ("/c/color/image_raw", stamp, kind, colour | {"frame": frames[0]}),
+            ("/c/rgb_rear/image_raw", stamp, kind, colour | {"frame": frames[0]}),
+            ("/c/depth/image_raw", stamp, kind, metres | {"frame": frames[1]}),
+        ]
+        if infos:
+            for camera in ("color", "rgb_rear"):
+                topic = f"/c/{camera}/camera_info"
+                written.append((topic, stamp, "sensor_msgs/msg/CameraInfo", camera_info(0.0)))
+    return bag(root, written)
+
+
+def raw_drive(root: Path) -> Path:
+    for camera, code in (("image_00", 60), ("image_01", 10)):
+        for k in range(3):
+            save(root / camera / "data" / f"{k:010d}.png", picture(code + k))
+        rows = "".join(f"2011-09-26 13:02:25.{k}00000000\n" for k in range(3))
+        (root / camera / "timestamps.txt").write_text(rows, encoding="utf-8")
+    write_calibration(root)
+    return moved(root, "its.json")
+
+
+def wide(root: Path) -> Path:
+    pairs(root).joinpath("calib.json").unlink()
+    write_chain(root, 2, (9.0,))
+    path = root / "camchain.yaml"
+    text = path.read_text(encoding="utf-8").replace(
+        "distortion_model: none", "distortion_model: equidistant\n  distortion_coeffs: [0, 0, 0, 0]"
+    )
+    path.write_text(text, encoding="utf-8")
+    return root
+
+
+CONVERT = ("camera convert", "{}/out.yaml")
+TO_ROS = ("camera convert", "{}/ros")
+OF_RECORDINGS = {
+    "rate of counters": Advice(depth, r"a second \((--fps) states otherwise\)", r"\1 30"),
+    "counters in associations": Advice(
+        lambda root: depth(root, list_=True), r"associations.txt counts .* \((--fps) s", r"\1 30"
+    ),
+    "times of too few images": Advice(
+        times_of_two, r"leave it out and say (--fps)", r"\1 20", without("times.txt")
+    ),
+    "unit of depth in doubt": Advice(
+        lambda root: depth(root, 9000), r"say which: (--set dataset.depth_scale=\d+) or", r"\1"
+    ),
+    "depth that no camera sees": Advice(
+        lambda root: depth(root, 60000),
+        r"say the unit: (--set dataset.depth_scale)=1000 for millimetres, (10000) for", r"\1=\2"
+    ),
+    "one of several cameras": Advice(
+        lambda root: depth(root, chain=True), r"say it: (--set dataset.colour_camera=0) for", r"\1"
+    ),
+    "a camera that is not there": Advice(
+        lambda root: depth(root, chain=True),
+        r"dataset.colour_camera is 9, but it has cameras 0 to (\d)",
+        r"--set dataset.colour_camera=\1", command=("inspect", "--set dataset.colour_camera=9"),
+    ),
+    "colour larger than depth": Advice(
+        larger_colour, r"resize the colour images to 32x24, and say (--set dataset.resized=true)",
+        r"\1", smaller_colour
+    ),
+    "colour without a calibration": Advice(
+        lambda root: moved(depth(root), "its.json"),
+        r"focal length; give one by (--camera) FILE", r"\1 {}/../its.json"
+    ),
+    "a bag's colour without a calibration": Advice(
+        lambda root: depth_bag(root, infos=False), r"no camera_info of .* by (--camera) FILE",
+        r"\1 {}/calib.json"
+    ),
+    "depth in another frame": Advice(
+        lambda root: depth_bag(root, ("colour", "infra")),
+        r"(\S+) is in the frame infra, (\S+) in colour: .* choose: (--topics) COLOUR,DEPTH",
+        r"\3 \2,\1"
+    ),
+    "another colour camera": Advice(
+        depth_bag, r"(\S+) is the depth of (/c/color\S+) \((--topics) COLOUR,DEPTH chooses others",
+        r"\3 /c/rgb_rear/image_raw,\1"
+    ),
+    "images without a calibration": Advice(
+        lambda root: moved(pairs(root), "its.json"), r"calib.json, or another one by (--camera) F",
+        r"\1 {}/../its.json"
+    ),
+    "a drive without its calibration": Advice(
+        raw_drive, r"of that date, or give one by (--camera) FILE", r"\1 {}/../its.json"
+    ),
+    "a view that is cut off": Advice(
+        wide, r"beyond is cut off \((dataset.fov_deg) chooses another angle\)", r"--set \1=165"
+    ),
+    "a format that no ending names": Advice(
+        converted, r"no format ends like that; known: (\.json) \(fgslam\)", r"{}/other\1",
+        command=("camera convert", "{}/out.abc"), drop="{}/out.abc"
+    ),
+    "lens of four coefficients": Advice(guessed_lens, r"say (--set dataset.lens=\w+)", r"\1"),
+    "baseline in millimetres": Advice(
+        lambda root: pairs(root, baseline_m=200.0), r"give it: (--unit 0.001) for", r"\1"
+    ),
+    "images made smaller": Advice(
+        lambda root: pairs(root, width=2 * WIDTH, height=2 * HEIGHT),
+        r"say so: (--set dataset.resized=true)", r"\1"
+    ),
+    "images that a file is not for": Advice(
+        lambda root: (pairs(root), root / "calib.json")[1], r"say so: .* (--scale) of fgslam",
+        r"\1", command=("camera show", "--size 64x48"),
+    ),
+    "images not rectified": Advice(
+        unrectified,
+        r"calibration by (--camera) FILE", r"\1 {}/../camchain.yaml"
+    ),
+    "bag without calibration": Advice(
+        uncalibrated, r"of both by (--camera) FILE", r"\1 {}/calib.json"
+    ),
+    "a camera that is not calibrated": Advice(
+        zero_info, r"of all cameras by (--camera) FILE", r"\1 {}/calib.json"
+    ),
+    "camera_info without baseline": Advice(
+        without_baseline, r"has no baseline.* (--camera) FILE", r"\1 {}/calib.json"
+    ),
+    "bag of both views": Advice(both_views, r"pair of views: (--camera) FILE", r"\1 {}/calib.json"),
+    "stills of both views": Advice(
+        stills, r"pair of views by (--camera) FILE", r"\1 {}/../half.json"
+    ),
+    "topics without sides": Advice(
+        unsided, r"which of (\S+), (\S+) are left and right .* say it: (--topics) LEFT,RIGHT",
+        r"\3 \1,\2"
+    ),
+    "topics of another pair": Advice(
+        two_pairs, r"also there: (\S+) with (\S+); (--topics) chooses", r"\3 \1,\2"
+    ),
+    "three topics without three cameras": Advice(
+        three_topics, r"three topics need one .* give it by (--camera) FILE",
+        r"\1 {}/camchain.yaml", command=(
+            "inspect",
+            "--topics /cam/left/image_raw,/cam/right/image_raw,/rear/left/image_raw",
+        ),
+    ),
+    "truth as odometry": Advice(
+        lambda root: driven(root, "/ground_truth/odom"),
+        r"for odometry: (\S+) .* (--topics) LEFT,RIGHT,ODOMETRY takes one",
+        r"\2 /cam/left/image_raw,/cam/right/image_raw,\1"
+    ),
+    "four cameras and two topics": Advice(
+        four_in_a_bag, r"those two: fgslam camera convert \S+ (two.yaml --cameras 0,1)",
+        r"--camera {}/two.yaml", lambda root: two_of_four(root),
+        command=("inspect", "--camera {}/camchain.yaml"), drop="--camera {}/camchain.yaml",
+    ),
+    "EuRoC without calibration": Advice(
+        uncalibrated_euroc, r"give a calibration by (--camera) FILE", r"\1 {}/mine.json"
+    ),
+    "place on the body": Advice(
+        lambda root: driven(root, "/odom"), r"\((dataset.camera_yaw_deg) and", r"--set \1=0"
+    ),
+    "odometry on another clock": Advice(
+        late_odometry, r"to its times: (--set odometry.time_offset_s)=SECONDS", r"\1=-1000",
+        command=("run", "--estimator odometry --out {}/out"),
+    ),
+    "several layouts": Advice(
+        two_layouts, r"say which, e.g. (--set dataset.kind=\w+)", r"\1"
+    ),
+    "a layout that is none": Advice(
+        truthless, r"dataset.kind=photos is no layout .*; use one of (\w+)",
+        r"--set dataset.kind=\1", command=("inspect", "--set dataset.kind=photos"),
+    ),
+    "times that are stated": Advice(
+        truthless, r"states its own times; leave (--fps) out",
+        command=("inspect", "--fps 5"), drop="--fps 5"
+    ),
+    "a calibration of its own": Advice(
+        kitti_drive, r"holds its own calibration; leave (--camera) out",
+        command=("inspect", "--camera {}/calib.json"), drop="--camera {}/calib.json",
+    ),
+    "a calibration that is not there": Advice(
+        pairs, r"no such calibration file; check (--camera)", r"\1 {}/calib.json",
+        command=("inspect", "--camera {}/gone.json"), drop="--camera {}/gone.json",
+    ),
+    "a start beyond the end": Advice(
+        truthless, r"(dataset.start) is 99 but .* has frames (\d+) to \d+: choose less",
+        r"--set \1=\2", command=("inspect", "--set dataset.start=99"),
+    ),
+    "a stop before the start": Advice(
+        truthless, r"(dataset.stop) \(2\) is not beyond dataset.start \((\d)\)",
+        r"--set \1=5", command=("inspect", "--set dataset.start=2 --set dataset.stop=2"),
+    ),
+    "images of no size": Advice(
+        truthless, r"(dataset.scale) 0.01 makes images .* choose a larger one",
+        r"--set \1=1", command=("inspect", "--set dataset.scale=0.01"),
+    ),
+    "noise without truth": Advice(
+        truthless, r"(odometry.kind) is synthetic but .* choose recorded or (\w+)",
+        r"--set \1=\2", command=("inspect", "--set odometry.kind=synthetic"),
+    ),
+    "no setting": Advice(
+        truthless, r"--set 3: not of the form a.b=value; e.g. (--set \S+)", r"\1",
+        command=("inspect", "--set 3"), drop="--set 3"
+    ),
+    "a recording that moved": Advice(
+        absent_recording, r"where the recording is: (--set dataset.path)=FOLDER", r"\1={}/here"
+    ),
+    "an output that exists": Advice(
+        converted, r"choose another name, or add (--overwrite)", r"\1", command=CONVERT
+    ),
+    "size that is not stated": Advice(
+        opencv, r"give it: (--size) 640x480", rf"\1 {WIDTH}x{HEIGHT}", command=CONVERT
+    ),
+    "size that a view needs": Advice(
+        opencv, r"on the command line (--size) WxH", rf"\1 {WIDTH}x{HEIGHT}",
+        command=("camera show", "")
+    ),
+    "too many cameras for a format": Advice(
+        four_cameras, r"choose them \((--cameras 0,1)\)", r"\1", command=TO_ROS
+    ),
+    "the right camera first": Advice(
+        right_one_first, r"choose them in that order: (--cameras 1,0)", r"\1", command=TO_ROS
+    ),
+    "poses without covariances": Advice(
+        with_truth, r"states no covariances; give them by (--covariance) FILE",
+        r"\1 {}/covariances.txt", covariances_of, command=("judge", "--truth {}/truth.tum"),
+    ),
+    "poses without truth": Advice(
+        lambda root: with_truth(root, covariances=True),
+        r"which could be judged by itself; give (--truth) FILE", r"\1 {}/truth.tum",
+        command=("judge", ""),
+    ),
+    "no words of covariances": Advice(
+        lambda root: with_truth(root, covariances=True),
+        r"(--tangent): no word 'sideways'; use (\w+)", r"\1 \2",
+        command=("judge", "--truth {}/truth.tum --tangent sideways"), drop="--tangent sideways",
+    ),
+}  # fmt: skip
+
+
+def two_of_four(root: Path) -> None:
+    """What the message advises, as it is typed."""
+    with pytest.MonkeyPatch.context() as patch:
+        done = main(patch, "camera", "convert", root / "camchain.yaml", root / "two.yaml",
+                    "--cameras", "0,1")  # fmt: skip
+    assert done == 0

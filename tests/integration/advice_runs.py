@@ -1,0 +1,325 @@
+"""Messages about experiments, runs and what is made of them, and what follows their advice."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import yaml
+from advice import Advice
+from advice_recordings import covariances_of, poses_file, with_truth
+from dataset_builders import image_folder
+from running import stop_after
+
+from fgslam.runs.config import make_config
+from fgslam.runs.run import run_experiment
+
+SIMULATED: dict[str, Any] = {
+    "name": "x",
+    "dataset": {"kind": "simulated_measurements", "stop": 4},
+    "estimator": {"kind": "landmark_kalman"},
+}
+ROOM = TemporaryDirectory(prefix="fgslam_advice_")
+MADE: dict[str, Path] = {}
+"""Run folders that were made once, by name; copied where one is needed."""
+
+
+def experiment(root: Path, **changes: Any) -> Path:
+    (root / "x.yaml").write_text(yaml.safe_dump(SIMULATED | changes), encoding="utf-8")
+    return root / "x.yaml"
+
+
+def simulated(**changes: Any) -> Callable[[Path], Path]:
+    dataset = SIMULATED["dataset"] | changes
+    return lambda root: experiment(root, dataset=dataset)
+
+
+def run_folder(root: Path, name: str = "finished", **changes: Any) -> Path:
+    """The run of a small experiment; of images it was interrupted after two frames."""
+    if name not in MADE:
+        folder = Path(ROOM.name) / name
+        if name == "interrupted":
+            images = {"kind": "image_folder", "path": str(image_folder(folder / "images"))}
+            changes |= {
+                "dataset": images,
+                "rig_memory": "off",
+                "odometry": {"kind": "constant_velocity"},
+            }
+        config = make_config(SIMULATED | changes, "test")
+        stopped = stop_after(3) if name == "interrupted" else lambda: False
+        run_experiment(config, folder / "run", "refuse", lambda *_: None, stopped)
+        MADE[name] = folder / "run"
+    return Path(shutil.copytree(MADE[name], root / "o"))
+
+
+def with_run(root: Path) -> Path:
+    run_folder(root)
+    return experiment(root)
+
+
+def interrupted(root: Path) -> Path:
+    return run_folder(root, "interrupted") / "config.yaml"
+
+
+def without_odometry(root: Path) -> Path:
+    return run_folder(root, "unsteered", odometry={"kind": "constant_velocity"})
+
+
+def twice(root: Path) -> Path:
+    (root / "p").mkdir()
+    run_folder(root / "p")
+    return run_folder(root)
+
+
+def of_other_versions(root: Path) -> Path:
+    given = interrupted(root)
+    path = root / "o" / "config.yaml"
+    text = yaml.safe_load(path.read_text(encoding="utf-8"))
+    text["provenance"]["versions"]["numpy"] = "0.1"
+    path.write_text(yaml.safe_dump(text), encoding="utf-8")
+    return given
+
+
+def damaged_state(root: Path) -> Path:
+    given = interrupted(root)
+    path = root / "o" / "checkpoint.npz"
+    with np.load(path) as held:
+        arrays = dict(held)
+    np.savez(path, **dict(list(arrays.items())[:-1]))
+    return given
+
+
+def measurements(**changes: Any) -> Callable[[Path], Path]:
+    """An experiment on what an earlier run measured."""
+
+    def make(root: Path) -> Path:
+        dataset = {"kind": "measurements", "path": str(run_folder(root))}
+        return experiment(root, dataset=dataset, **changes)
+
+    return make
+
+
+def graph_file(root: Path) -> Path:
+    """Three poses of a square's side, in the plane."""
+    rows = [f"VERTEX_SE2 {k} {k} 0 0" for k in range(3)]
+    rows += [f"EDGE_SE2 {k} {k + 1} 1 0 0 100 0 0 100 0 100" for k in range(2)]
+    (root / "graph.g2o").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return root / "graph.g2o"
+
+
+def scaled(root: Path, rotation: float) -> Path:
+    """Poses whose stated covariances have other rotations than they should."""
+    given = with_truth(root, covariances=True)
+    rows = np.loadtxt(given)
+    scale = np.repeat([rotation, 1.0], 3)
+    rows[:, 8:] *= np.outer(scale, scale)[np.triu_indices(6)]
+    np.savetxt(given, rows, fmt="%.9f")
+    return given
+
+
+def in_degrees(root: Path) -> Path:
+    return scaled(root, float(np.degrees(1.0)))
+
+
+def different_parts(root: Path) -> Path:
+    """Rotations that are ten times better known than positions, and as well estimated."""
+    return scaled(root, 0.1)
+
+
+def without_covariances(root: Path) -> Path:
+    given = with_truth(root, covariances=True)
+    rows = np.loadtxt(given)
+    rows[:, 8:] = 0.0
+    np.savetxt(given, rows, fmt="%.9f")
+    return given
+
+
+def two_estimates(root: Path) -> Path:
+    poses_file(root, "other.tum", covariances=True)
+    return with_truth(root, covariances=True)
+
+
+RUN = ("run", "--out {}/o")
+OF_RUNS = {
+    "two ways with what exists": Advice(
+        with_run, r"--overwrite and (--resume) exclude each other; give one",
+        command=("run", "--out {}/o --overwrite --resume"), drop="--resume",
+    ),
+    "results that exist": Advice(with_run, r"or add (--overwrite) or --resume", r"\1", command=RUN),
+    "nothing to resume": Advice(
+        with_run, r"has finished; use (--overwrite) to run again", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "no run to resume": Advice(
+        experiment, r"or start one without (--resume)",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "resumed with another seed": Advice(
+        interrupted, r"or start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --set seed=9 --resume"), drop="--resume",
+    ),
+    "resumed with other packages": Advice(
+        of_other_versions, r"numpy 0.1 -> .* or start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "a damaged state": Advice(
+        damaged_state, r"not a state that .* start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "a value with keys": Advice(
+        experiment, r"--set (\S+)=3: name holds a value",
+        command=("run", "--out {}/o --set name.a=3"), drop="--set name.a=3",
+    ),
+    "a map's start without a map": Advice(
+        image_folder, r"map.start and map.extend mean nothing without a map",
+        command=("run", "--out {}/o --set map.start=last"), drop="--set map.start=last",
+    ),
+    "a viewer of measurements": Advice(
+        experiment, r"--live and --save-rrd show SLAM on images, .* leave them out",
+        command=("run", "--out {}/o --save-rrd {}/a.rrd"), drop="--save-rrd {}/a.rrd",
+    ),
+    "a memory of cameras that are not corrected": Advice(
+        experiment, r"--camera-out: this run takes its cameras as calibrated",
+        command=("run", "--out {}/o --camera-out {}/a.json"), drop="--camera-out {}/a.json",
+    ),
+    "a calibration for an experiment": Advice(
+        experiment, r"--camera is for a recording",
+        command=("run", "--out {}/o --camera {}/a.json"), drop="--camera {}/a.json",
+    ),
+    "an experiment that is not there": Advice(
+        lambda root: (experiment(root), root / "there.yaml")[1], r"e.g. (\w+) \(fgslam run --help",
+        "--help", command=RUN,
+    ),
+    "no frame of a drive": Advice(
+        simulated(stop=None, start=999), r"lower (dataset.start) or raise", r"--set \1=60",
+        command=RUN,
+    ),
+    "a path that a place has not": Advice(
+        simulated(world={"place": "corridor"}), r"choose one of (\w+), or another dataset.world",
+        r"--set dataset.drive.path=\1 --set dataset.drive.frames=null", command=RUN,
+    ),
+    "a start of measurements": Advice(
+        measurements(), r"set (dataset.stop) alone", r"--set \1=3",
+        command=("run", "--out {}/n --set dataset.start=1"), drop="--set dataset.start=1",
+    ),
+    "noise for measurements": Advice(
+        measurements(odometry={"kind": "synthetic"}), r"choose (recorded) or constant_velocity",
+        r"--set odometry.kind=\1", command=("run", "--out {}/n"),
+    ),
+    "tracks that are not there": Advice(
+        lambda root: experiment(
+            root, dataset={"kind": "stereo_tracks", "file": str(root / "none.txt"), "stop": 3}
+        ), r"dataset.file is (\w+),", r"--set dataset.file=\1", command=RUN,
+    ),
+    "a seed without trials": Advice(
+        run_folder, r"--seed means nothing without --trials; give both or none",
+        command=("compare", "--estimators odometry --seed 3"), drop="--seed 3",
+    ),
+    "trials of two runs": Advice(
+        twice, r"(--trials) takes one run or experiment at a time; give one",
+        command=("compare", "{}/p/o --trials 2 --out {}/c"), drop="{}/p/o",
+    ),
+    "trials of a file": Advice(
+        experiment, r"or add (--trials) N", r"\1 2 --out {}/c", command=("compare", ""),
+    ),
+    "no such estimator": Advice(
+        run_folder, r"give (--estimators) with some of (\w+)", r"\1 \2",
+        command=("compare", "--estimators nosuch"), drop="--estimators nosuch",
+    ),
+    "a setting of what was measured": Advice(
+        run_folder, r"or (--trials) to run the experiment again", r"\1 2 --out {}/c",
+        command=("compare", "--estimators odometry --set seed=3"),
+    ),
+    "a setting of no estimator": Advice(
+        run_folder, r"of the form (estimators)\.NAME\.key=value with NAME one of (\w+)",
+        r"--set \1.\2.label=a",
+        command=("compare", "--estimators odometry --set estimators.nosuch.label=a"),
+        drop="--set estimators.nosuch.label=a",
+    ),
+    "another kind": Advice(
+        run_folder, r"use (--estimators)", r"\1 odometry",
+        command=("compare", "--estimators ekf --set estimators.ekf.kind=odometry"),
+        drop="--estimators ekf --set estimators.ekf.kind=odometry",
+    ),
+    "a comparison in the run itself": Advice(
+        run_folder, r"holds the run itself; choose another", "--out {}/c",
+        command=("compare", "--estimators odometry --out {}/o"), drop="--out {}/o",
+    ),
+    "a comparison that exists": Advice(
+        twice, r"choose another --out, or add (--overwrite) or", r"\1",
+        command=("compare", "--estimators odometry --out {}/p/o"),
+    ),
+    "two runs of one name": Advice(
+        twice, r"compare them without (--out)",
+        command=("compare", "{}/p/o --estimators odometry --out {}/c"), drop="--out {}/c",
+    ),
+    "dead reckoning of no odometry": Advice(
+        without_odometry, r"--estimators odometry: .* leave it out", "--estimators landmark_kalman",
+        command=("compare", "--estimators odometry,landmark_kalman"),
+        drop="--estimators odometry,landmark_kalman",
+    ),
+    "a filter of a pose graph": Advice(
+        graph_file, r"give (--estimators) (\S+)", r"\1 \2",
+        command=("compare", "--estimators ekf"), drop="--estimators ekf",
+    ),
+    "axes of a bag": Advice(
+        run_folder, r"leave (--axes) out",
+        command=("export", "--trajectory {}/a.mcap --axes camera"), drop="--axes camera",
+    ),
+    "nothing to export": Advice(
+        run_folder, r"give (--map) FILE(.ply)", r"\1 {}/a\2", command=("export", ""),
+    ),
+    "an estimator that did not run": Advice(
+        run_folder, r"give (--estimator) with one of (\w+)", r"\1 \2",
+        command=("export", "--trajectory {}/a.tum --estimator nosuch"), drop="--estimator nosuch",
+    ),
+    "no values": Advice(
+        experiment, r"give FIRST:END", "--set seed=0:1",
+        command=("sweep", "--out {}/s --jobs 1 --set seed=3:3"), drop="--set seed=3:3",
+    ),
+    "an empty value": Advice(
+        experiment, r"a value is empty; remove a comma", "--set seed=1",
+        command=("sweep", "--out {}/s --jobs 1 --set seed=1,"), drop="--set seed=1,",
+    ),
+    "a value given twice": Advice(
+        experiment, r"a value is given twice; remove one", "--set seed=1",
+        command=("sweep", "--out {}/s --jobs 1 --set seed=1,1"), drop="--set seed=1,1",
+    ),
+    "a key given twice": Advice(
+        experiment, r"given twice; write (seed)=A,B", r"--set \1=1,2",
+        command=("sweep", "--out {}/s --jobs 1 --set seed=1 --set seed=2"),
+        drop="--set seed=1 --set seed=2",
+    ),
+    "no values of a key": Advice(
+        experiment, r"e.g. (--set seed)=0:100", r"\1=0:1",
+        command=("sweep", "--out {}/s --jobs 1 --set seed"), drop="--set seed",
+    ),
+    "workers here and elsewhere": Advice(
+        experiment, r"(--jobs) is for workers of this machine",
+        command=("sweep", "--out {}/s --set seed=1 --jobs 1 --scheduler tcp://127.0.0.1:1"),
+        drop="--scheduler tcp://127.0.0.1:1",
+    ),
+    "covariances of one of two": Advice(
+        two_estimates, r"judge them one by one",
+        command=("judge", "{}/other.tum --covariance {}/none.txt --truth {}/truth.tum"),
+        drop="{}/other.tum --covariance {}/none.txt",
+    ),
+    "covariances in degrees": Advice(
+        in_degrees, r"state what they are: (--tangent \S+)", r"\1",
+        command=("judge", "--truth {}/truth.tum --tangent rotation_first,local"),
+        drop="--tangent rotation_first,local",
+    ),
+    "covariances in another order": Advice(
+        different_parts, r"fits the errors far better; if so, (--tangent \S+)", r"\1",
+        command=("judge", "--truth {}/truth.tum --tangent translation_first,local"),
+        drop="--tangent translation_first,local",
+    ),
+    "covariances that are zero": Advice(
+        without_covariances, r"or give them by (--covariance) FILE", r"\1 {}/covariances.txt",
+        covariances_of, command=("judge", "--truth {}/truth.tum"),
+    ),
+}  # fmt: skip
