@@ -131,7 +131,7 @@ class ErrorColumns:
         begun = len(self._map)
         rows = np.concatenate([self._free[:again], np.arange(begun, begun + len(ids) - again)])
         self._free = self._free[again:]
-        of_map = {name: values[name] for name in self._map.columns()}
+        of_map = {name: values[name] for name in self._map.packed()}
         self._map.append({name: array[again:] for name, array in of_map.items()})
         for name, array in of_map.items():
             self._map[name][rows[:again]] = array[:again]

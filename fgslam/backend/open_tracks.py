@@ -102,6 +102,6 @@ class OpenTracks(GrowingColumns):
         judged = ended & (counts >= LEAST_SIGHTINGS)
         rows = np.flatnonzero(judged[track])
         rows = rows[np.argsort(track[rows], kind="stable")]
-        out = {name: of[rows] for name, of in self.columns().items()}
+        out = {name: of[rows] for name, of in self.packed().items()}
         self.drop(ended[track])
         return out, counts[judged]

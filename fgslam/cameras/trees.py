@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -119,12 +120,10 @@ class _Loader(PlainLoader):
     most_values = 1_000_000
 
 
-def _mapping(loader: yaml.SafeLoader, node: Any) -> Any:
-    return loader.construct_mapping(node, deep=True)
-
-
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _mapping)
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_tag}", partial(_Loader.construct_mapping, deep=True)
+    )
 
 
 def read_tree(path: Path) -> Tree | None:

@@ -144,10 +144,6 @@ class GrowingColumns:
             raise AttributeError(f"{type(self).__name__} has no column {name}")
         return self[name]
 
-    def columns(self) -> StateArrays:
-        """All columns as views, by name."""
-        return {name: self[name] for name in self._buffers}
-
     def append(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
         """Adds rows (k, ...): one array for every column."""
         count = len(next(iter(values.values())))
@@ -176,8 +172,8 @@ class GrowingColumns:
             self.take(0, np.argsort(self[name], kind="stable"))
 
     def packed(self) -> StateArrays:
-        """All columns, without the room for more."""
-        return self.columns()
+        """All columns as views, by name, without the room for more."""
+        return {name: self[name] for name in self._buffers}
 
     @classmethod
     def unpacked(cls, packed: StateArrays) -> Self:

@@ -180,7 +180,7 @@ def prior_information(rig: CameraRig) -> FloatArray:
     As if a grid of displacements in every image had been measured as zero, with a noise for which
     the displacements predicted by the terms of images have this standard deviation in the mean.
     """
-    unit = _grid_displacements(rig)
+    unit = displacements(rig, _grid(rig))
     out = np.eye(unit.shape[2]) / BASELINE_SIGMA**2
     for k in range(rig.cameras):  # the reference camera's own are those of all
         own = len(TERMS) * (k - 1) + np.arange(len(IMAGE_TERMS))
@@ -255,11 +255,6 @@ def shared_information(rig: CameraRig, expected_px: float) -> FloatArray:
     return out
 
 
-def _grid_displacements(rig: CameraRig) -> FloatArray:
-    """Displacements (k, 2 * cameras, p) at points spread over the image, by a unit of each term."""
-    return displacements(rig, _grid(rig))
-
-
 def _grid(rig: CameraRig) -> FloatArray:
     """(k, cameras, 2) pixels spread over the image, the same in all cameras."""
     column, row = np.meshgrid(*(np.linspace(0, n - 1, _GRID) for n in (rig.width, rig.height)))
@@ -305,7 +300,7 @@ class RigCorrection(Brief):
     def rms_px(self) -> float:
         """Displacement of the other cameras against the right one, rms over the image, pixels."""
         own = slice(-len(COMMON))
-        moved = _grid_displacements(self.rig)[..., own] @ self.values[own]
+        moved = displacements(self.rig, _grid(self.rig))[..., own] @ self.values[own]
         pixels = moved.reshape(-1, self.rig.cameras, 2)[:, 1:]
         return float(np.sqrt((pixels**2).sum(axis=2).mean()))
 
@@ -317,7 +312,7 @@ class RigCorrection(Brief):
         (yaw), upwards (pitch) or counter-clockwise as seen from behind it (roll), so that its image
         moves right, down or clockwise; and where its focal length is longer.
         """
-        unit = _grid_displacements(self.rig)
+        unit = displacements(self.rig, _grid(self.rig))
         which = [TERMS.index(name) for name in ("yaw", "pitch", "roll", "focal")]
         out: dict[str, tuple[float, float]] = {}
         for k, camera in enumerate(_CAMERAS[: self.rig.cameras - 1]):

@@ -365,6 +365,13 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
 _FOCAL_RANGE = 1000.0
 """Of focal length and image size: at one end a telescope, at the other no picture."""
 
+_LENGTHS = dict.fromkeys(("fx", "fy"), "the focal length in pixels") | dict.fromkeys(
+    ("baseline", "vertical_baseline"),
+    "the distance between the cameras in metres; one camera alone cannot measure depth, "
+    "and a negative one means that left and right are swapped",
+)
+"""What must be positive, and what it is."""
+
 
 def rig_fault(rig: CameraRig) -> str:
     """Why the numbers cannot be those of a rig, and what to give; empty where they can."""
@@ -372,9 +379,11 @@ def rig_fault(rig: CameraRig) -> str:
         value = getattr(rig, name)
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:
             return f"{name} is {value!r}; give the images' size in pixels"
-    for name in ("fx", "fy", "baseline", "vertical_baseline"):
-        if fault := _length_fault(rig, name):
-            return fault
+    for name, what in _LENGTHS.items():
+        value = getattr(rig, name)
+        absent = name == "vertical_baseline" and value is None
+        if not absent and not (is_finite_number(value) and value > 0.0):
+            return f"{name} is {value!r}, not a positive number; give {what}"
     for name in ("fx", "fy"):
         value, size = getattr(rig, name), max(rig.width, rig.height)
         if not size / _FOCAL_RANGE <= value <= size * _FOCAL_RANGE:
@@ -390,25 +399,6 @@ def rig_fault(rig: CameraRig) -> str:
                 f"{name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
                 "give the principal point (column, row) in pixels of these images"
             )
-    return _mounting_fault(rig)
-
-
-def _length_fault(rig: CameraRig, name: str) -> str:
-    value = getattr(rig, name)
-    if name == "vertical_baseline" and value is None:
-        return ""
-    if is_finite_number(value) and value > 0.0:
-        return ""
-    what = (
-        "the distance between the cameras in metres; one camera alone cannot measure depth, "
-        "and a negative one means that left and right are swapped"
-        if "baseline" in name
-        else "the focal length in pixels"
-    )
-    return f"{name} is {value!r}, not a positive number; give {what}"
-
-
-def _mounting_fault(rig: CameraRig) -> str:
     if not isinstance(rig.exact, bool | np.bool_):
         return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
     if rig.places not in get_args(RigPlaces):

@@ -5,7 +5,7 @@ Derived in docs/derivations/measurements.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import lru_cache
@@ -460,11 +460,11 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
     for three cameras has variances 5/12, 5/12 and 3/4 against the paper's 1, 1 and 1.
     """
     if kind == "fused":
-        return partial_map(range(cameras), cameras, ratio)
+        return partial_map(tuple(range(cameras)), cameras, ratio)
     out = np.zeros((3, 2 * cameras))
     out[0, 0] = out[1, 1] = 1.0
     # Weights inverse to the variances; one half each where both baselines are equal.
-    weight = 1.0 if cameras == 2 else _horizontal_weight(ratio)
+    weight = 1.0 if cameras == 2 else ratio**2 / (1.0 + ratio**2)
     out[2, 2], out[2, 0] = weight, -weight
     if cameras == 3:
         out[2, 5] = (1.0 - weight) * ratio
@@ -497,7 +497,8 @@ def pixel_covariance(cameras: int, places: RigPlaces) -> FloatArray:
     return own + np.tile(np.eye(2), (cameras, cameras))
 
 
-def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:
+@lru_cache(maxsize=64)  # inverted once: each frame asks for it several times
+def partial_map(seen: tuple[int, ...], cameras: int, ratio: float) -> FloatArray:
     """The map `fused` (3, 2 * seen) from the pixels of two cameras or more of a rig's; read only.
 
     Args:
@@ -505,21 +506,10 @@ def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:
         cameras: how many the rig has.
         ratio: :func:`vertical_to_horizontal`.
     """
-    return _fused_map(tuple(seen), cameras, ratio)
-
-
-@lru_cache(maxsize=64)
-def _fused_map(seen: tuple[int, ...], cameras: int, ratio: float) -> FloatArray:
-    """Inverted once: each frame asks for it several times."""
     model = pixel_model(cameras, ratio).reshape(cameras, 2, 3)[list(seen)]
     out = np.asarray(np.linalg.pinv(model.reshape(-1, 3)), np.float64)
     out.flags.writeable = False
     return out
-
-
-def _horizontal_weight(ratio: float) -> float:
-    squared = ratio**2
-    return squared / (1.0 + squared)
 
 
 _NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))

@@ -227,8 +227,12 @@ class Floor:
             return wTc
         translation = wTc[:3, 3] - self.down * (self.down @ wTc[:3, 3])
         rotation = wTc[:3, :3]
-        if self.dof == 3:
-            rotation = self._turn_about_vertical(rotation)
+        if self.dof == 3:  # the turn about the vertical that is nearest
+            n = self.down
+            twice = rotation - rotation.T
+            sine = n @ np.array([twice[2, 1], twice[0, 2], twice[1, 0]])
+            cosine = np.trace(rotation) - n @ rotation @ n
+            rotation = so3_exp(n * np.arctan2(sine, cosine))
         return pose(rotation, translation)
 
     def basis(self, wTc: FloatArray) -> FloatArray:
@@ -248,19 +252,6 @@ class Floor:
             return covariance
         basis = self.basis(wTc)
         return congruence(basis @ basis.T, covariance)
-
-    def _turn_about_vertical(self, rotation: FloatArray) -> FloatArray:
-        """The rotation about the vertical that is nearest to ``rotation``."""
-        n = self.down
-        sine = n @ np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        cosine = np.trace(rotation) - n @ rotation @ n
-        return so3_exp(n * np.arctan2(sine, cosine))
 
 
 # ------------------------------------------------------------------------------------------

@@ -76,7 +76,7 @@ def open_recording(
     known = None if found.rectifier is None else found.rectifier.calibration
     if known is not None and known.guessed_lens:
         found = _by_lens(found, known.guessed_lens, lambda s: read(s, odometry), settings)
-    if found.rectifier is not None and found.unrectified:
+    if found.rectifier is not None and found.rectifier.maps:
         misfit = fit_notes(lambda i: found.frame(i).images, len(found), found.rectifier)
         found = replace(found, notes=(*misfit, *found.notes))
     found = replace(found, ledger=ledger_of(found, settings))

@@ -87,11 +87,6 @@ class Recording(Brief):
     calibration: str = ""
     load_depth: DepthLoader | None = None
 
-    @property
-    def unrectified(self) -> bool:
-        """Whether the images are rectified when they are read."""
-        return self.rectifier is not None and bool(self.rectifier.maps)
-
     def __len__(self) -> int:
         return len(self.indices)
 

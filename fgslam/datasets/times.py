@@ -633,7 +633,12 @@ def pair_files(found: CameraFiles, at_once: bool = True) -> Pairs:
     if right is None or left is None:
         named = _by_names(found, _MOMENTS)
     elif at_once:
-        named = _by_time(found, right, left)
+        of_left, of_right = (f"{found.folder}, {side}" for side in found.sides)
+        others = [(found.sides[0], of_left, left)]
+        rows, notes, entry = pair_stamps(right, others, of_right, found.sides[1])
+        note = f"{' and '.join(found.sides)} images are paired by the times that their names are"
+        pairs = tuple((found.right[i], found.left[j]) for i, j in rows.tolist())
+        return pairs, (note, *notes), entry
     return _by_order(found) if named is None else named
 
 
@@ -683,13 +688,3 @@ def _by_order(found: CameraFiles) -> Pairs:
     both = " and ".join(found.sides)
     note = f"{both} images are paired by their order: their names do not match"
     return pairs, (note,), Entry(PAIRING, "by their order", note, guessed=True)
-
-
-def _by_time(found: CameraFiles, right: IntArray, left: IntArray) -> Pairs:
-    """The nearest in time."""
-    of_left, of_right = (f"{found.folder}, {side}" for side in found.sides)
-    rows, notes, entry = pair_stamps(
-        right, [(found.sides[0], of_left, left)], of_right, found.sides[1]
-    )
-    note = f"{' and '.join(found.sides)} images are paired by the times that their names are"
-    return tuple((found.right[i], found.left[j]) for i, j in rows.tolist()), (note, *notes), entry

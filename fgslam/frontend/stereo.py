@@ -260,7 +260,7 @@ class StereoMatcher:
         """The map from the pixels of SIFT features in the images ``seen``, all equally good."""
         linear = self._map
         if len(seen) < cameras:
-            linear = partial_map(seen, cameras, self._vertical_to_horizontal)
+            linear = partial_map(tuple(seen), cameras, self._vertical_to_horizontal)
         return linear, self._independent(linear)
 
     def _independent(self, linear: FloatArray) -> FloatArray:

@@ -479,8 +479,8 @@ class ThirdViewConsistency:
         for c in self._walks.near(b, _ORDER_REACH):
             if c in (a, b) or (b, c) not in self._maps or (a, c) not in self._maps:
                 continue
-            direct = self._maps[a, c]
-            by_b = _followed(self._maps[a, b], self._maps[b, c])
+            direct, step = self._maps[a, c], self._maps[a, b]
+            by_b = np.where(step >= 0, self._maps[b, c][step], -1)
             both = (direct >= 0) & (by_b >= 0)
             count += self._alike(c, direct[both], by_b[both])
         return count
@@ -508,11 +508,6 @@ def sift_inliers(answer: Answer, matches: BearingMatches) -> IntArray | None:
         return None
     kept = matches.select(answer.inliers & (matches.kind == FeatureKind.SIFT))
     return np.column_stack([kept.index_a, kept.index_b])
-
-
-def _followed(first: IntArray, second: IntArray) -> IntArray:
-    """(n,) rows after two steps, -1 where one of them is missing."""
-    return np.asarray(np.where(first >= 0, second[first], -1))
 
 
 # --------------------------------------------------------------------------------------------

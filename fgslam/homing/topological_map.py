@@ -68,7 +68,10 @@ class TopologicalMap:
 
     def graph(self) -> csr_matrix:
         """(n, n) symmetric matrix of costs."""
-        return _graph(len(self), self.links, self.costs)
+        ends = np.array([(link.a, link.b) for link in self.links], dtype=np.int64).reshape(-1, 2)
+        both = np.vstack([ends, ends[:, ::-1]])
+        weights = np.concatenate([self.costs, self.costs])
+        return coo_matrix((weights, (both[:, 0], both[:, 1])), (len(self), len(self))).tocsr()
 
     def components(self) -> tuple[IntArray, ...]:
         """Node numbers of the connected parts, the largest first."""
@@ -242,13 +245,6 @@ def link_cost(link: Link) -> float:
     variance = np.nan_to_num(max(link.covariance[0, 0], link.back_covariance[0, 0]))
     weak = _DOUBLING_SUPPORT / max(link.support, 1)
     return float(1.0 + weak + variance / _SIGMA_OF_ONE**2)
-
-
-def _graph(count: int, links: Sequence[Link], costs: FloatArray) -> csr_matrix:
-    ends = np.array([(link.a, link.b) for link in links], dtype=np.int64).reshape(-1, 2)
-    both = np.vstack([ends, ends[:, ::-1]])
-    weights = np.concatenate([costs, costs])
-    return coo_matrix((weights, (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
 
 
 # --------------------------------------------------------------------------------------------

@@ -540,10 +540,7 @@ class IdentityBook:
         self._id[new], self._missed[new] = new_ids, 0
         self._count += len(new)
         self._point_of_id.append(new)
-        return Sightings(*out, pruned_ids=self._prune())
-
-    def _prune(self) -> IntArray:
         gone = (self._id >= 0) & (self._missed >= self._prune_after)
         pruned = np.sort(self._id[gone])
         self._id[gone] = -1
-        return pruned
+        return Sightings(*out, pruned_ids=pruned)

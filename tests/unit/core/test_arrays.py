@@ -108,7 +108,7 @@ def test_growing_columns_equal_plain_arrays(steps) -> None:
         np.testing.assert_array_equal(columns["name"], names)
         np.testing.assert_array_equal(columns["pair"], pairs)
     assert columns["pair"].dtype == np.float32
-    assert sum(column.nbytes for column in columns.columns().values()) == 16 * len(columns)
+    assert sum(column.nbytes for column in columns.packed().values()) == 16 * len(columns)
 
 
 def test_a_snapshot_is_not_touched_by_what_follows() -> None:

@@ -420,7 +420,8 @@ def test_a_real_drive_fits_its_calibration_and_no_other(shared_data: Path) -> No
     if not root.is_dir() or not other.is_file():
         pytest.skip(f"no raw recording at {root}, or no calibration at {other}")
     found = open_recording(EurocSettings(path=str(root), stop=3))
-    assert found.unrectified
+    assert found.rectifier is not None
+    assert found.rectifier.maps
     assert not any("does not fit" in note for note in found.notes)
     wrong = open_recording(EurocSettings(path=str(root), stop=3, camera_file=str(other)))
     assert re.search(f"{other.name} does not fit these images", wrong.notes[0])
