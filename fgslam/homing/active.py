@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.parts import HomingEstimator
-from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray, middle
 from fgslam.core.bearings import (
     BearingMatches,
     HomeVector,
@@ -237,9 +237,7 @@ def _misfit(pose: FloatArray, landmarks: FloatArray, seen: FloatArray) -> float:
     apart = (seen + pose[2] - np.arctan2(y, x))[np.isfinite(x + y)]
     if len(apart) < _FEWEST:
         return float("nan")
-    ordered = np.sort(np.abs(wrap(apart)))
-    # NumPy's own median takes ten times as long for so few, and this is asked with every image.
-    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+    return middle(np.abs(wrap(apart)))
 
 
 def parallax(matches: BearingMatches, rotation: float) -> float:

@@ -176,6 +176,11 @@ def _selected(
     return teacher.finish().memory
 
 
+_SEEKING = (HomingState.INITIALISE, HomingState.WAIT, HomingState.SEARCH, HomingState.REFUSED)
+_LOOK_EVERY_S = 0.5  # while the next path image is not matched
+_GIVE_UP_S = 10.0  # of tries after a leg was abandoned, until the path is
+
+
 class PathFollower:
     """Drives along a taught path: an image in, speed and turning rate out.
 
@@ -229,12 +234,17 @@ class PathFollower:
         behaviour = HomingBehaviourSettings() if behaviour is None else behaviour
         for given, kind in ((behaviour, HomingBehaviourSettings), (front_end, FrontEndSettings)):
             _require_kind(given, kind, "PathFollower")
-        chain = HomingChain(
+        self._chain = HomingChain(
             make_front_end(camera, front_end, seed),
             path.images,
             lambda start: make_homing_estimator(start, settings),
         )
-        self._homing = GuidedHoming(chain, path, (camera, front_end, seed), tracks=by == "tracks")
+        self._tracks, self._last = by == "tracks", len(path) - 1
+        self._extractor = OmniFeatureExtractor(camera, front_end.features)
+        self._places = PathPlaces(path, front_end, seed)
+        self._next_look = -np.inf
+        self._given_up_at: float | None = None
+        self._ended: Command | None = None
         self._steering = Steering(behaviour.steering)
         self._longest_step = 1.0 / behaviour.loop.images_per_s
         self._time: float | None = None
@@ -255,7 +265,7 @@ class PathFollower:
         self._require_open()
         seconds = self._elapsed(time)
         size = (self._camera.width, self._camera.height)
-        command, place = self._homing.step(colour_image(image, size), float(time))
+        command, place = self._guided(colour_image(image, size), float(time))
         drive = self._steering.step(command, seconds)
         self._time = float(time)
         return DriveCommand(drive.speed, drive.turn_rate, command, place)
@@ -281,22 +291,22 @@ class PathFollower:
                 "time that is not negative"
             )
         self._steering.driven(Drive(v, omega, overridden=True))
-        self._homing.chain.held_up(seconds)
+        self._chain.held_up(seconds)
 
     @property
     def finished(self) -> bool:
         """Whether the last target is reached, or the path abandoned."""
-        return self._homing.finished
+        return self._ended is not None
 
     @property
     def legs(self) -> tuple[LegOutcome, ...]:
         """How each leg that is over ended, in order."""
-        return tuple(self._homing.chain.outcomes)
+        return tuple(self._chain.outcomes)
 
     def close(self) -> None:
         """Ends it; the present leg, if any, ends unfinished."""
         if not self._closed and self._time is not None:
-            self._homing.chain.interrupt(self._time, "closed")
+            self._chain.interrupt(self._time, "closed")
         self._closed = True
 
     def __enter__(self) -> PathFollower:
@@ -304,6 +314,80 @@ class PathFollower:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    # ----------------------------------------------------------------------------------------
+    # With tracks the chain of homings drives, and the place is looked for only while the next path
+    # image is not matched: at the start, after the robot was carried off, when a leg is abandoned.
+    # Without tracks every image is looked at, and its homing vector is the command.
+
+    def _guided(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
+        """The command after one more image, and its place if that was looked for."""
+        if self._ended is not None:
+            now = None if self._tracks else self._place(image)  # a recording may go on
+            return replace(self._ended, time=time), None if isinstance(now, Refusal) else now
+        command, place = self._tracked(image, time) if self._tracks else self._looked(image, time)
+        if not self._tracks:
+            over = command.state is HomingState.ARRIVED
+        elif self._chain.given_up:
+            over = self._given_up_at is not None and time - self._given_up_at > _GIVE_UP_S
+        else:
+            over = self._chain.finished
+        if over:
+            self._ended = command
+        return command, place
+
+    def _tracked(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
+        command = self._chain.step(image, time)
+        if command.state not in _SEEKING:
+            self._given_up_at = None
+            return command, None
+        if self._chain.given_up and self._given_up_at is None:
+            self._given_up_at = time
+        if time < self._next_look:
+            return command, None
+        self._next_look = time + _LOOK_EVERY_S
+        place = self._place(image)
+        if isinstance(place, Refusal):
+            return command, None
+        known = place.sure and place.vector is not None
+        if known and (self._chain.given_up or place.target != self._chain.target):
+            self._chain.aim(place.target, time, f"found near path image {place.nearest}")
+            self._given_up_at = None
+            command = self._chain.step(image, time)
+        return command, place
+
+    def _looked(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
+        place = self._place(image)
+        if isinstance(place, Refusal):
+            return Command(time, HomingState.WAIT, place.details, refusal=place), None
+        target, final = place.target, place.target == self._last
+        if place.reached:
+            reason = "reached the path's end"
+            return Command(time, HomingState.ARRIVED, reason, target=target), place
+        if place.vector is None:
+            lost = Refusal(RefusalReason.LOST, place.refusal)
+            why = time, HomingState.WAIT, place.refusal
+            return Command(*why, target=target, final=final, refusal=lost), place
+        covariance = np.full((3, 3), np.nan)
+        covariance[1:, 1:] = place.vector.covariance
+        command = Command(
+            time=time,
+            state=HomingState.DRIVE,
+            heading=place.vector.direction,
+            remaining=place.remaining,
+            rotation=place.vector.rotation,
+            covariance=covariance,
+            stop=False,
+            reason=f"{place.vector.support} inliers",
+            target=target,
+            final=final,
+        )
+        return command, place
+
+    def _place(self, image: ByteArray) -> PathPlace | Refusal:
+        features = self._extractor.extract(image)
+        refusal = unusable(image, features)
+        return self._places.look(features) if refusal is None else refusal
 
     def _require_open(self) -> None:
         if self._closed:
@@ -339,151 +423,3 @@ def _require_kind(settings: object, kind: type, who: str) -> None:
             f"{who}: settings are a {type(settings).__name__}; give a {kind.__module__}."
             f"{kind.__name__}, or None for the defaults"
         )
-
-
-# --------------------------------------------------------------------------------------------
-# Path following by a robot that may be anywhere: homings, and the place on the path
-#
-# With tracks the chain of homings drives, and the place is looked for only while the next path
-# image is not matched: at the start, after the robot was carried off, when a leg is abandoned.
-# Without tracks every image is looked at, and its homing vector is the command.
-
-
-_SEEKING = (HomingState.INITIALISE, HomingState.WAIT, HomingState.SEARCH, HomingState.REFUSED)
-_LOOK_EVERY_S = 0.5  # while the next path image is not matched
-_GIVE_UP_S = 10.0  # of tries after a leg was abandoned, until the path is
-
-
-class GuidedHoming:
-    """A chain of homings that knows its place on the path.
-
-    Attributes:
-        chain: the homings.
-    """
-
-    def __init__(
-        self,
-        chain: HomingChain,
-        path: PathMemory,
-        front_end: tuple[OmniCamera, FrontEndSettings, int],
-        *,
-        tracks: bool,
-    ) -> None:
-        """Begins before the first image.
-
-        Args:
-            chain: fresh; of the same path.
-            path: taught.
-            front_end: camera of the images, settings, and the seed of everything random.
-            tracks: whether the chain drives.
-        """
-        camera, settings, seed = front_end
-        self.chain = chain
-        self._tracks, self._last = tracks, len(path) - 1
-        self._extractor = OmniFeatureExtractor(camera, settings.features)
-        self._places = PathPlaces(path, settings, seed)
-        self._time: float | None = None
-        self._next_look = -np.inf
-        self._given_up_at: float | None = None
-        self._ended: Command | None = None
-
-    @property
-    def finished(self) -> bool:
-        """Whether the path's end is reached, or the path abandoned."""
-        return self._ended is not None
-
-    def step(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
-        """The command after one more image, and its place if that was looked for.
-
-        Raises:
-            EstimatorError: time does not increase; nothing has changed then.
-        """
-        self._time = later_time(time, self._time, "homing", EstimatorError)
-        if self._ended is not None:
-            return replace(self._ended, time=time), None if self._tracks else self._where(image)
-        command, place = self._tracked(image, time) if self._tracks else self._looked(image, time)
-        if self._is_end(command):
-            self._ended = command
-        return command, place
-
-    def _is_end(self, command: Command) -> bool:
-        if not self._tracks:
-            return command.state is HomingState.ARRIVED
-        if self.chain.given_up:
-            began = self._given_up_at
-            return began is not None and command.time - began > _GIVE_UP_S
-        return self.chain.finished
-
-    # ----------------------------------------------------------------------------------------
-
-    def _tracked(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
-        command = self.chain.step(image, time)
-        if command.state not in _SEEKING:
-            self._given_up_at = None
-            return command, None
-        if self.chain.given_up and self._given_up_at is None:
-            self._given_up_at = time
-        if time < self._next_look:
-            return command, None
-        self._next_look = time + _LOOK_EVERY_S
-        place = self._place(image)
-        if isinstance(place, Refusal):
-            return command, None
-        known = place.sure and place.vector is not None
-        if known and (self.chain.given_up or place.target != self.chain.target):
-            self.chain.aim(place.target, time, f"found near path image {place.nearest}")
-            self._given_up_at = None
-            command = self.chain.step(image, time)
-        return command, place
-
-    def _looked(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:
-        place = self._place(image)
-        if isinstance(place, Refusal):
-            return _standing(time, place), None
-        target, final = place.target, place.target == self._last
-        if place.reached:
-            arrived = _standing(time, Refusal(RefusalReason.AT_TARGET, "reached the path's end"))
-            state = HomingState.ARRIVED
-            return replace(arrived, state=state, target=target, refusal=None), place
-        if place.vector is None:
-            why = _standing(time, Refusal(RefusalReason.LOST, place.refusal))
-            return replace(why, target=target, final=final), place
-        covariance = np.full((3, 3), np.nan)
-        covariance[1:, 1:] = place.vector.covariance
-        command = Command(
-            time=time,
-            state=HomingState.DRIVE,
-            heading=place.vector.direction,
-            remaining=place.remaining,
-            rotation=place.vector.rotation,
-            covariance=covariance,
-            stop=False,
-            reason=f"{place.vector.support} inliers",
-            target=target,
-            final=final,
-        )
-        return command, place
-
-    def _where(self, image: ByteArray) -> PathPlace | None:
-        """The place of an image after the end: a recording may go on."""
-        place = self._place(image)
-        return None if isinstance(place, Refusal) else place
-
-    def _place(self, image: ByteArray) -> PathPlace | Refusal:
-        features = self._extractor.extract(image)
-        refusal = unusable(image, features)
-        return self._places.look(features) if refusal is None else refusal
-
-
-def _standing(time: float, refusal: Refusal) -> Command:
-    return Command(
-        time=time,
-        state=HomingState.WAIT,
-        heading=0.0,
-        remaining=1.0,
-        rotation=float("nan"),
-        covariance=np.full((3, 3), np.nan),
-        stop=True,
-        reason=refusal.details,
-        refusal=refusal,
-    )

@@ -366,17 +366,8 @@ class HomingController:
     def _without_estimate(
         self, time: float, state: HomingState, why: str, refusal: Refusal | None = None
     ) -> Command:
-        return Command(
-            time=time,
-            state=state,
-            heading=0.0,
-            remaining=self.remaining,
-            rotation=float("nan"),
-            covariance=np.full((3, 3), np.nan),
-            stop=state not in (HomingState.BLIND, HomingState.SEARCH),
-            reason=why,
-            refusal=refusal,
-        )
+        stop = state not in (HomingState.BLIND, HomingState.SEARCH)
+        return Command(time, state, why, remaining=self.remaining, stop=stop, refusal=refusal)
 
 
 # --------------------------------------------------------------------------------------------

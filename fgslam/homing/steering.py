@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
 
@@ -261,13 +262,13 @@ class Command:
     Attributes:
         time: of the image, seconds.
         state: of the homing.
+        reason: one clause: why the state is what it is.
         heading: direction of home from the robot's heading, radians; 0 where it is not known.
         remaining: part of the leg that is left: 1 where it began; its last known value while
             there is no estimate.
         rotation: heading of the target minus the present one, radians; NaN while not known.
         covariance: (3, 3) of (remaining, heading, rotation); NaN while there is no estimate.
         stop: the robot must stand.
-        reason: one clause: why the state is what it is.
         target: number of the target image.
         final: it is the path's last one.
         refusal: why the homing ended, in state REFUSED.
@@ -275,12 +276,12 @@ class Command:
 
     time: float
     state: HomingState
-    heading: float
-    remaining: float
-    rotation: float
-    covariance: FloatArray
-    stop: bool
     reason: str
+    heading: float = 0.0
+    remaining: float = 1.0
+    rotation: float = math.nan
+    covariance: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    stop: bool = True
     target: int = 0
     final: bool = True
     refusal: Refusal | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -129,8 +129,8 @@ class TopologicalMap:
         stored = _StoredMap(StoredPath.of(self.memory), self.links, self.costs)
         return FILE.save(path, stored) / 1000.0 / max(len(self), 1)
 
-    @staticmethod
-    def load(path: str | Path) -> TopologicalMap:
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
         """Reads a map; pixel positions of features are NaN, and nothing is known as rejected.
 
         Raises:
@@ -138,9 +138,7 @@ class TopologicalMap:
         """
         stored = FILE.load(path)
         memory = stored.places.memory(str(path))
-        return TopologicalMap(
-            memory.images, memory.names, stored.links, stored.costs, {}, memory.camera
-        )
+        return cls(memory.images, memory.names, stored.links, stored.costs, {}, memory.camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,14 +294,8 @@ class MapPlace:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RouteMap:
-    """Several routes as one map.
-
-    Attributes:
-        topology: the map; its nodes are called ``route/image``.
-    """
-
-    topology: TopologicalMap
+class RouteMap(TopologicalMap):
+    """Several routes as one map; its nodes are called ``route/image``."""
 
     @staticmethod
     def join(
@@ -328,15 +320,7 @@ class RouteMap:
         )
         answers, rows = _both_ways(ask, memory.images, there)
         joined = map_of_answers(memory.images, answers, walks=walks, names=memory.names, rows=rows)
-        return RouteMap(_with_driven_steps(joined, walks, memory.camera))
-
-    def __len__(self) -> int:
-        return len(self.topology)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the places."""
-        return self.topology.names
+        return _with_driven_steps(joined, walks, memory.camera)
 
     def knows(self, name: str) -> bool:
         """Whether a place or a route is called so."""
@@ -345,7 +329,7 @@ class RouteMap:
     def link(self, start: str, end: str) -> Link:
         """From one place to another, by their names. Raises StoredMapError where they have none."""
         a, b = self._node(start), self._node(end)
-        for link in self.topology.links:
+        for link in self.links:
             if (link.a, link.b) == (min(a, b), max(a, b)):
                 return link if a < b else link.reversed()
         raise StoredMapError(f"map: {start} and {end} are not linked")
@@ -354,7 +338,7 @@ class RouteMap:
     def crossroads(self) -> tuple[str, ...]:
         """Names of places that are linked with more than two others."""
         degree = np.zeros(len(self), np.int64)
-        for link in self.topology.links:
+        for link in self.links:
             degree[[link.a, link.b]] += 1
         return tuple(name for name, links in zip(self.names, degree, strict=True) if links > 2)
 
@@ -372,7 +356,7 @@ class RouteMap:
             CalibrationError: the routes were taught with several cameras, and none is given.
             FrameError: the image is not the camera's.
         """
-        camera = camera or self.topology.camera
+        camera = camera or self.camera
         if camera is None:
             raise CalibrationError(
                 "map: its routes were taught with several cameras; give the image's, --camera FILE"
@@ -396,17 +380,8 @@ class RouteMap:
         if isinstance(start, MapPlace):
             nodes = self._with_image(start.links).route(len(self), end)[1:]
         else:
-            nodes = self.topology.route(self._node(start), end)
-        return self.topology.path(nodes)
-
-    def save(self, path: str | Path) -> float:
-        """Writes the map atomically; kilobytes a path image. Raises OutputError."""
-        return self.topology.save(path)
-
-    @staticmethod
-    def load(path: str | Path) -> RouteMap:
-        """Reads a map. Raises StoredMapError where the file is no sound map."""
-        return RouteMap(TopologicalMap.load(path))
+            nodes = self.route(self._node(start), end)
+        return self.path(nodes)
 
     # ----------------------------------------------------------------------------------------
 
@@ -422,9 +397,9 @@ class RouteMap:
 
     def _placed(self, features: OmniFeatures, ask: Asker) -> MapPlace | Refusal:
         """The place of an image as the node that it would be."""
-        here, known = len(self), [link for link in self.topology.links if link.support]
+        here, known = len(self), [link for link in self.links if link.support]
         pairs = [(node, here) for node in self._alike(features)]
-        answers, _ = _both_ways(ask, (*self.topology.images, features), pairs)
+        answers, _ = _both_ways(ask, (*self.images, features), pairs)
         links, _ = link_pairs(answers)
         checks = LinkConsistency(here + 1, [*known, *links])
         accepted, _ = checks.accepted({(link.a, link.b) for link in known})
@@ -440,17 +415,16 @@ class RouteMap:
         """Nodes that an image is tried against."""
         if len(self) <= _ALL:
             return list(range(len(self)))
-        words = VisualWords(self.topology.images, np.random.default_rng(_STREAM))
+        words = VisualWords(self.images, np.random.default_rng(_STREAM))
         order = np.argsort(-words.likeness(features), kind="stable")
         return sorted(order[:_CANDIDATES].tolist())
 
     def _with_image(self, links: Iterable[Link]) -> TopologicalMap:
         """The map with one more node, whose features are not needed."""
-        old, mine = self.topology, tuple(links)
-        usual = _usual_support(old.links)
-        costs = [*old.costs.tolist(), *(_undriven_cost(link, usual) for link in mine)]
-        images, names = (*old.images, old.images[0]), (*old.names, "the image")
-        return TopologicalMap(images, names, (*old.links, *mine), np.array(costs), {})
+        mine, usual = tuple(links), _usual_support(self.links)
+        costs = [*self.costs.tolist(), *(_undriven_cost(link, usual) for link in mine)]
+        images, names = (*self.images, self.images[0]), (*self.names, "the image")
+        return TopologicalMap(images, names, (*self.links, *mine), np.array(costs), {})
 
 
 def route_of(name: str) -> str:
@@ -505,9 +479,7 @@ def _memory_of(routes: Mapping[str, PathMemory]) -> tuple[PathMemory, Walks]:
     return PathMemory(images, tuple(names), camera), walks
 
 
-def _with_driven_steps(
-    joined: TopologicalMap, walks: Walks, camera: OmniCamera | None
-) -> TopologicalMap:
+def _with_driven_steps(joined: TopologicalMap, walks: Walks, camera: OmniCamera | None) -> RouteMap:
     """With links along the routes also where there is no homing vector: the way was driven.
 
     They cost as much as a dozen legs, so that they are gone where there is nothing else.
@@ -523,9 +495,7 @@ def _with_driven_steps(
     costs = [
         link_cost(link) if _ends(link) in steps else _undriven_cost(link, usual) for link in links
     ]
-    return TopologicalMap(
-        joined.images, joined.names, links, np.array(costs), joined.rejected, camera
-    )
+    return RouteMap(joined.images, joined.names, links, np.array(costs), joined.rejected, camera)
 
 
 def _undriven_cost(link: Link, usual: float) -> float:

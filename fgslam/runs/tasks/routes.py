@@ -490,14 +490,14 @@ def _run_joining(
     written = folder / MAP_FILE if config.map is None else Path(config.map)
     if config.map is not None:
         joined.save(written)
-    write_links(folder, joined.topology)
+    write_links(folder, joined)
     # Links between images of two routes, by the routes' names.
-    ends = [[route_of(joined.names[k]) for k in (m.a, m.b)] for m in joined.topology.links]
+    ends = [[route_of(joined.names[k]) for k in (m.a, m.b)] for m in joined.links]
     meetings = Counter(f"{first} and {second}" for first, second in ends if first != second)
-    parts = joined.topology.components()
+    parts = joined.components()
     numbers: dict[str, JsonValue] = {
         "nodes": len(joined),
-        "links": len(joined.topology.links),
+        "links": len(joined.links),
         "links_between_routes": meetings.total(),
         "crossroads": len(joined.crossroads),
         "components": len(parts),
@@ -520,7 +520,7 @@ def _run_joining(
         True,
         numbers,
         f"{len(joined)} path images of {len(routes)} routes",
-        (map_figure(joined.topology),),
+        (map_figure(joined),),
         lines=lines,
         tables=(table,),
         notes=tuple(failures),

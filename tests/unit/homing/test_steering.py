@@ -34,7 +34,7 @@ DT = 0.1
 def command(heading: float = 0.0, remaining: float = 1.0, **changes: object) -> Command:
     """A command to drive."""
     made = Command(
-        0.0, HomingState.DRIVE, heading, remaining, 0.0, np.full((3, 3), np.nan), False, ""
+        0.0, HomingState.DRIVE, "", heading=heading, remaining=remaining, rotation=0.0, stop=False
     )
     return replace(made, **changes)  # type: ignore[arg-type]
 

@@ -565,9 +565,7 @@ def joined(routes: dict[str, fg.PathMemory]) -> RouteMap:
 
 def test_routes_that_cross_are_joined_by_true_links(joined: RouteMap) -> None:
     poses = np.array([(x, y, 0.0) for x, y in EAST] + [(x, y, np.pi / 2) for x, y in NORTH])
-    between = [
-        link for link in joined.topology.links if link.a < ROUTE_COUNT <= link.b < 2 * ROUTE_COUNT
-    ]
+    between = [link for link in joined.links if link.a < ROUTE_COUNT <= link.b < 2 * ROUTE_COUNT]
     assert len(between) >= 3
     for link in between:
         way = poses[link.b, :2] - poses[link.a, :2]
@@ -578,7 +576,7 @@ def test_routes_that_cross_are_joined_by_true_links(joined: RouteMap) -> None:
 
 
 def test_rooms_that_share_a_poster_are_not_joined(joined: RouteMap) -> None:
-    assert [len(part) for part in joined.topology.components()] == [
+    assert [len(part) for part in joined.components()] == [
         2 * ROUTE_COUNT,
         ROUTE_COUNT - 1,
     ]
@@ -627,7 +625,7 @@ def test_a_gap_in_a_route_is_a_way_of_last_resort(routes: dict[str, fg.PathMemor
     assert link.support == 0
     assert np.isnan(link.direction)
     assert joined.way("through/a", "through").names[-1] == "through/f"
-    assert joined.topology.costs.max() > 20.0
+    assert joined.costs.max() > 20.0
 
 
 def test_wrong_routes_and_places_are_refused(
@@ -649,7 +647,7 @@ def test_wrong_routes_and_places_are_refused(
 
 
 def test_values_that_no_map_has_are_refused(joined: RouteMap, tmp_path: Path) -> None:
-    topology, path = joined.topology, tmp_path / "bad.fgmap"
+    topology, path = joined, tmp_path / "bad.fgmap"
     first, *others = topology.links
 
     def with_first(**values: Any) -> TopologicalMap:
@@ -671,6 +669,6 @@ def test_values_that_no_map_has_are_refused(joined: RouteMap, tmp_path: Path) ->
 
 
 def test_places_of_one_name_are_refused(joined: RouteMap, tmp_path: Path) -> None:
-    replace(joined.topology, names=("a/0",) * len(joined)).save(tmp_path / "bad.fgmap")
+    replace(joined, names=("a/0",) * len(joined)).save(tmp_path / "bad.fgmap")
     with pytest.raises(StoredMapError, match="two places have one name"):
         RouteMap.load(tmp_path / "bad.fgmap")
