@@ -16,7 +16,7 @@ from fgslam.core.files import require_output
 
 if TYPE_CHECKING:
     from fgslam.cameras.boards import Board
-    from fgslam.runs.calibrating import Asked
+    from fgslam.cameras.lenses import Calibration
 
 calibrate_app = typer.Typer(
     help="Calibrate cameras from images of a board, a mirror from one of rings.",
@@ -214,13 +214,13 @@ class FileOptions:
     fov: float | None = None
     cameras: str | None = None
 
-    def of(self, file: Path, outputs: Iterable[Path], overwrite: bool) -> Asked:
-        """What is asked of a file. Raises OutputError where an output is in the way."""
-        from fgslam.runs.calibrating import Asked
+    def read(self, file: Path, outputs: Iterable[Path], overwrite: bool) -> Calibration:
+        """The calibration of a file. Raises OutputError where an output is in the way."""
+        from fgslam.runs.calibrating import read_calibration
 
         for path in outputs:
             require_output(path, overwrite, [file, *([] if self.second is None else [self.second])])
-        return Asked(file, self.second, self.size, self.scale, self.unit, self.fov, self.cameras)
+        return read_calibration(file, **vars(self))
 
 
 @command(camera_app)
@@ -235,7 +235,8 @@ def show(file: Path, given: FileOptions, out: Path | None = None, overwrite: boo
     """
     from fgslam.runs.calibrating import show_calibration
 
-    _show(show_calibration(given.of(file, [] if out is None else [out], overwrite), out))
+    found = given.read(file, [] if out is None else [out], overwrite)
+    _show(show_calibration(found, out, given.fov))
 
 
 @command(camera_app)
@@ -260,4 +261,4 @@ def convert(
 
     # Of a folder, which may hold a recording, the files that it gets.
     parts = [*out.glob("*.yaml"), *out.glob("*/sensor.yaml")] if out.is_dir() else [out]
-    _show(convert_calibration(given.of(file, parts, overwrite), out, form))
+    _show(convert_calibration(given.read(file, parts, overwrite), out, form, given.fov))

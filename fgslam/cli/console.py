@@ -32,46 +32,34 @@ _WIDTH_OF_FILES = 120
 _BORDER = 3  # of a column: a line and a space at each side
 
 
-class Display:
-    """A bar for each stage of the work, with the time left.
+@contextmanager
+def progress_bar(console: Console | None = None) -> Iterator[Tell]:
+    """A bar for each stage of the work, with the time left; on standard error, if not elsewhere.
 
     Drawn from the first stage on: before, a mistake shall stand alone.
     """
+    bars = Progress(
+        TextColumn("{task.description:>10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console or Console(stderr=True),
+    )
+    stages: dict[str, TaskID] = {}
 
-    def __init__(self, console: Console) -> None:
-        """Draws on a console, once there is a stage."""
-        columns = (
-            TextColumn("{task.description:>10}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        self._bars = Progress(*columns, console=console)
-        self._stages: dict[str, TaskID] = {}
+    def tell(what: str, done: int, total: int) -> None:
+        if not stages:
+            bars.start()
+        if what not in stages:
+            stages[what] = bars.add_task(what, total=total)
+        bars.update(stages[what], completed=done, total=total)
 
-    def tell(self, what: str, done: int, total: int) -> None:
-        """Shows how much of a stage is done."""
-        if not self._stages:
-            self._bars.start()
-        if what not in self._stages:
-            self._stages[what] = self._bars.add_task(what, total=total)
-        self._bars.update(self._stages[what], completed=done, total=total)
-
-    def close(self) -> None:
-        """Leaves the bars as they stand."""
-        if self._stages:
-            self._bars.stop()
-
-
-@contextmanager
-def progress_bar() -> Iterator[Tell]:
-    """A bar on standard error for each stage of the work."""
-    found = Display(Console(stderr=True))
     try:
-        yield found.tell
+        yield tell
     finally:
-        found.close()
+        if stages:
+            bars.stop()
 
 
 def show(result: RunResult, resume: str = "") -> None:

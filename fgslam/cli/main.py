@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +20,7 @@ from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import ConfigError, FgslamError, one_line
 from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import find_experiment, list_experiments
+from fgslam.runs.wanted import Wanted
 
 if TYPE_CHECKING:
     from fgslam.runs.classics import ClassicRow
@@ -485,28 +486,7 @@ def localize(
 
 
 @command(app)
-def export(  # noqa: PLR0913 - each option is a parameter
-    run_folder: options.RunFolderOrMap,
-    map_file: Path | None = None,
-    trajectory: Path | None = None,
-    graph: Path | None = None,
-    images: Path | None = None,
-    frame: Literal["left", "right", "body"] | None = None,
-    axes: Literal["camera", "ros"] | None = None,
-    estimator: str | None = None,
-    valid_only: bool = False,
-    colour: bool = False,
-    dense: Path | None = None,
-    mesh: Path | None = None,
-    grid: Path | None = None,
-    voxel: float | None = None,
-    max_range: float | None = None,
-    cameras: int | None = None,
-    every: int = 2,
-    sigma: float | None = None,
-    recording: Path | None = None,
-    overwrite: bool = False,
-) -> None:
+def export(run_folder: options.RunFolderOrMap, wanted: Wanted) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
     Of a saved map alone it lists what is in it. --dense, --mesh and --grid match every pixel of the
@@ -514,50 +494,11 @@ def export(  # noqa: PLR0913 - each option is a parameter
 
     Args:
         run_folder (RUN|MAP): a run folder, or a saved map
-        map_file (--map): landmarks as .ply or .pcd
-        trajectory: camera poses as .tum, .kitti, .csv (EuRoC) or .mcap (ROS 2)
-        graph: measurements, poses and landmarks as .g2o, for other solvers
-        images (DIR): images, poses and points, for COLMAP
-        frame: what the trajectory is of; default what the recording's truth is of, else left
-        axes: of trajectory and map: x right, y down (camera), or x forward, z up (ros); default
-            ros with .mcap, else camera
-        estimator: which estimator's; default the one that steered
-        valid_only: landmarks seen in at least three frames
-        colour: --map in the images' colours, with normals
-        dense: all that the images show, as points with colours and sigma, .ply or .pcd
-        mesh: the same as triangles, .ply
-        grid: free, occupied and unknown cells of the floor, Nav2's .yaml with its .pgm
-        voxel (METRES): side of voxels and of the grid's cells; default three pixels at the median
-            depth
-        max_range (--range METRES): farthest depth; default by the cameras' precision
-        cameras: 2 leaves the top camera out
-        every: of the frames every so many are matched densely
-        sigma (METRES): what is known less well is left out of --dense and --mesh; default 2.25
-            voxels
-        recording: where the run's recording is now; default where it was, or next to the run
-        overwrite: replace an earlier one
+        wanted: what to hand over
     """
     from fgslam.cli.console import progress_bar
-    from fgslam.runs.dense import DenseSettings
-    from fgslam.runs.export import Wanted, export_run
+    from fgslam.runs.export import export_run
 
-    wanted = Wanted(
-        map=map_file,
-        trajectory=trajectory,
-        graph=graph,
-        images=images,
-        frame=frame,
-        axes=axes,
-        estimator=estimator,
-        valid_only=valid_only,
-        colour=colour,
-        dense=dense,
-        mesh=mesh,
-        grid=grid,
-        how=DenseSettings(voxel, max_range, cameras, every, sigma),
-        recording=recording,
-        overwrite=overwrite,
-    )
     with progress_bar() as progress:
         lines = export_run(run_folder, wanted, progress)
     for line in lines:

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from plotly import graph_objects as go
 
 
+UNKNOWN = "-"
+"""In the cell of a table whose value is not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class Column:
     """A column of a table: heading with unit, and what it means."""
@@ -139,7 +143,7 @@ class Page:
 
     title: str
     subtitle: str
-    headline: tuple[str, ...]
+    headline: tuple[str, ...] = ()
     tables: tuple[TextTable, ...] = ()
     figures: tuple[Figure, ...] = ()
     pictures: tuple[Picture, ...] = ()

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, thinned
 from fgslam.core.bearings import HomingEstimate, HomingTruth
+from fgslam.evaluation.localisation import Answers
 from fgslam.report.content import (
     GREY,
     INK,
@@ -157,64 +158,56 @@ _MAX_LANDMARKS = 6_000
 _HEADING = 0.025  # length of a heading, as a share of the picture
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Located:
-    """Answers of the relocalisation; all in the map's world, metres.
+def located_figure(
+    words: tuple[str, str],
+    landmarks: FloatArray,
+    path: FloatArray,
+    answers: Answers,
+    false: BoolArray,
+) -> Figure:
+    """The map from above with the poses found in it, and the true poses of refused queries.
 
-    Attributes:
+    All in the map's world, metres.
+
+    Args:
+        words: key and heading of the figure.
         landmarks: (m, 3) positions.
         path: (k, 4, 4) poses of the drive that made the map.
-        found: (n,) whether the query's pose was accepted.
-        poses: (n, 4, 4) poses found; anything where refused.
-        covariances: (n, 6, 6) of them, in the tangent space.
-        truth: (n, 4, 4) true poses; NaN where unknown.
+        answers: n of them.
         false: (n,) accepted and somewhere else.
     """
-
-    landmarks: FloatArray
-    path: FloatArray
-    found: BoolArray
-    poses: FloatArray
-    covariances: FloatArray
-    truth: FloatArray
-    false: BoolArray
-
-
-def located_figure(located: Located, key: str, heading: str) -> Figure:
-    """The map from above with the poses found in it, and the true poses of refused queries."""
     level = level_axes(np.array([0.0, -1.0, 0.0]))[:2]
-    known = np.asarray(np.isfinite(located.truth).all(axis=(1, 2)))
-    shown = [located.poses[located.found], located.truth[known], located.path]
-    ranges = bulk_limits(np.concatenate(shown)[:, :3, 3] @ level.T, located.landmarks @ level.T)
+    known = np.asarray(np.isfinite(answers.truth).all(axis=(1, 2)))
+    shown = [answers.poses[answers.accepted], answers.truth[known], path]
+    ranges = bulk_limits(np.concatenate(shown)[:, :3, 3] @ level.T, landmarks @ level.T)
     span = max(high - low for low, high in ranges)
-    right = located.found & ~located.false
-    found = located.poses[right]
-    world = world_position_covariances(found, located.covariances[right])
+    right = answers.accepted & ~false
+    found = answers.poses[right]
+    world = world_position_covariances(found, answers.covariances[right])
     covariances = in_plane(world, level)
     factor = exaggeration(covariances, span)
-    rows = thinned(len(located.landmarks), _MAX_LANDMARKS)
+    rows = thinned(len(landmarks), _MAX_LANDMARKS)
     around = outlines(found[:, :3, 3] @ level.T, covariances, factor)
     traces: list[Any] = [
-        dots("landmarks", located.landmarks[rows] @ level.T, GREY, 3.0),
-        line("drive of the map", located.path[:, :3, 3] @ level.T, GREY, 1.5),
+        dots("landmarks", landmarks[rows] @ level.T, GREY, 3.0),
+        line("drive of the map", path[:, :3, 3] @ level.T, GREY, 1.5),
         line("uncertainty", around, colour(0), 1.0),
     ]
     for number, name, poses, symbol in (
         (0, "found", found, "circle"),
-        (1, "found, but false", located.poses[located.false], "circle"),
-        (4, "refused", located.truth[~located.found & known], "x-thin-open"),
+        (1, "found, but false", answers.poses[false], "circle"),
+        (4, "refused", answers.truth[~answers.accepted & known], "x-thin-open"),
     ):
         if len(poses):
             at, ahead = poses[:, :3, 3] @ level.T, poses[:, :3, 2] @ level.T
             traces.append(dots(name, at, colour(number), 7.0, symbol, legendgroup=name))
             ticks = np.stack([at, at + _HEADING * span * ahead], axis=1)
             traces.append(line(name, ticks, colour(number), 1.5, group=name))
-    if (wrong := located.false & known).any():
-        ends = np.stack([located.poses[wrong, :3, 3], located.truth[wrong, :3, 3]], axis=1)
+    if (wrong := false & known).any():
+        ends = np.stack([answers.poses[wrong, :3, 3], answers.truth[wrong, :3, 3]], axis=1)
         traces.append(line("to the true pose", ends @ level.T, colour(1), 1.0))
     return Figure(
-        key,
-        heading,
+        *words,
         "Dots with their headings: poses that were accepted, with ellipses of "
         f"{SIGMAS:.0f} standard deviations. Crosses: true poses of queries that were refused. "
         "Lines lead from false poses to the true ones. Grey: landmarks, and the drive that made "

@@ -13,7 +13,7 @@ import hashlib
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -181,11 +181,9 @@ def write_report(path: Path, data: ReportData) -> None:
 def slam_page(data: ReportData) -> Page:
     """Sentences, tables and figures of a run."""
     rig = data.calibration
-    return Page(
-        title=data.title,
-        subtitle=data.subtitle,
+    return replace(
+        data,
         headline=headline(data),
-        tables=data.tables,
         figures=(
             drawn.drive_from_above(data),
             drawn.map_to_turn(data),
@@ -198,14 +196,8 @@ def slam_page(data: ReportData) -> Page:
             *([drawn.noise_over_time(data)] if any(e.noise for e in data.estimators) else []),
             *([drawn.calibration_over_time(rig, data.start)] if rig is not None else []),
         ),
-        pictures=data.pictures,
         failed=frozenset((*data.alarms, *(e.title for e in data.estimators if e.failure))),
-        notes=data.notes,
-        remarks=data.remarks,
-        config_yaml=data.config_yaml,
-        versions=data.versions,
-        about=data.about,
-        commands=data.commands,
+        remarks=data.remarks_of_all,
         drive=drawn.drive_along(data),
     )
 
@@ -229,7 +221,7 @@ def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
         why = "there is no ground truth" if data.truth is None else "too few poses have a truth"
         return f"How accurate the path is, is not known: {why}."
     poses = " or ".join(f"{count:,}" for count in counts)
-    how = f"root mean square position error of {poses} poses, {data.alignment}"
+    how = f"root mean square position error of {poses} poses, SE3 aligned"
     first, title = ranked[0]
     if len(ranked) == 1:
         return f"{title} is off by {metres(first)} ({how})."

@@ -24,7 +24,7 @@ from fgslam.evaluation.statistics import (
     to_estimate_world,
 )
 from fgslam.evaluation.truth import sound_truth
-from fgslam.report.content import Picture, TextTable
+from fgslam.report.content import Page
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class EstimatorReport:
         nees: (n,) normalised error squared of the final pose per degree of freedom; NaN unknown.
         nees_band: interval that holds 95 % of a consistent estimator's values, or None.
         update_ms: (n,) milliseconds a frame; NaN where not timed.
-        ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` states.
+        ate_m: absolute trajectory error of the final path, after SE3 alignment.
         matched_poses: of how many poses; judged_poses: and NEES.
         truth_remark: which true poses are left out of all but the first, and why.
         nees_per_dof: mean NEES of the run per degree of freedom.
@@ -132,48 +132,29 @@ class EstimatorReport:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReportData:
+class ReportData(Page):
     """Results of one run with the words of its page or viewer.
 
     Attributes:
-        title, subtitle: headings.
-        notes: what was tolerated in the recording, warnings, in words.
-        truth: true poses in the estimates' world; None where there are none.
         estimators: one or more, in the order of the table; their colours follow it.
-        tables: the estimators side by side, closures taken and refused.
+        truth: true poses in the estimates' world; None where there are none.
         closures: pairs of frames (closing, returned to) of the loops closed, counted in the first
             estimator's poses.
-        pictures: of the run.
-        config_yaml: the resolved configuration, as text.
-        versions: of the program and its libraries; None where one is not installed.
         up: (3,) the world's vertical, upwards; need not be of unit length.
-        alignment: how the errors behind ``ate_m`` were aligned, in words.
         alarms: what makes the run no success, in sentences.
         calibration: (n,) each, the columns of calibration.csv; None where the run kept none.
         stages: (n,) each, `timestamp` and milliseconds of every stage of the live loop.
         views: small JPEG images of the reference camera by the row of the first estimator's path.
-        about: titles of estimators and what each is, in a sentence.
-        commands: what one may type next.
     """
 
-    title: str
-    subtitle: str
-    estimators: tuple[EstimatorReport, ...]
+    estimators: tuple[EstimatorReport, ...] = ()
     truth: Trajectory | None = None
-    notes: tuple[str, ...] = ()
-    tables: tuple[TextTable, ...] = ()
     closures: tuple[tuple[int, int], ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    config_yaml: str = ""
-    versions: Mapping[str, str | None] = field(default_factory=dict)
     up: FloatArray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))
-    alignment: str = "SE3 aligned"
     alarms: tuple[str, ...] = ()
     calibration: Mapping[str, FloatArray] | None = None
     stages: Mapping[str, FloatArray] | None = None
     views: Mapping[int, bytes] = field(default_factory=dict)
-    about: tuple[tuple[str, str], ...] = ()
-    commands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         titles = [estimator.title for estimator in self.estimators]
@@ -181,7 +162,7 @@ class ReportData:
             raise ValueError(f"titles of estimators are not unique: {titles}")
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def remarks_of_all(self) -> tuple[str, ...]:
         """What the estimators had to correct or leave out, and why some failed, in words."""
         lines = [f"{e.title}: {remark}" for e in self.estimators for remark in e.remarks]
         lines += [f"{e.title} failed: {e.failure}" for e in self.estimators if e.failure]

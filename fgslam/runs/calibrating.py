@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -456,29 +455,26 @@ def calibrate_mirror(
 _EDGE_STEPS = 60
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """Which calibration, and what it leaves open; see :func:`fgslam.load_rig`."""
+def read_calibration(
+    path: Path,
+    second: Path | None = None,
+    size: str | None = None,
+    scale: bool = False,
+    unit: float = 1.0,
+    fov: float | None = None,
+    cameras: str | None = None,
+) -> Calibration:
+    """The calibration of a file, what it leaves open being stated; see :func:`fgslam.load_rig`.
 
-    path: Path
-    second: Path | None = None
-    size: str | None = None
-    scale: bool = False
-    unit_m: float = 1.0
-    fov_deg: float | None = None
-    cameras: str | None = None
-
-    def read(self) -> Calibration:
-        """The calibration. Raises CalibrationError, or ConfigError for an option that is none."""
-        size = None if self.size is None else _whole_numbers(self.size, "x", "--size", "640x480")
-        chosen = None
-        if self.cameras is not None:
-            chosen = _whole_numbers(self.cameras, ",", "--cameras", "0,1")
-        pair = None if size is None else (size[0], size[1]) if len(size) == 2 else size
-        require_options(pair, self.unit_m, self.fov_deg)
-        found = read_calibration_file(self.path, self.second, pair)  # type: ignore[arg-type]
-        found = in_metres(chosen_cameras(found, chosen), self.unit_m)
-        return at_size(found, pair, self.scale)  # type: ignore[arg-type]
+    Raises CalibrationError, or ConfigError for an option that is none.
+    """
+    sizes = None if size is None else _whole_numbers(size, "x", "--size", "640x480")
+    chosen = None if cameras is None else _whole_numbers(cameras, ",", "--cameras", "0,1")
+    pair = None if sizes is None else (sizes[0], sizes[1]) if len(sizes) == 2 else sizes
+    require_options(pair, unit, fov)
+    found = read_calibration_file(path, second, pair)  # type: ignore[arg-type]
+    found = in_metres(chosen_cameras(found, chosen), unit)
+    return at_size(found, pair, scale)  # type: ignore[arg-type]
 
 
 def _whole_numbers(text: str, separator: str, option: str, example: str) -> tuple[int, ...]:
@@ -492,20 +488,21 @@ def _whole_numbers(text: str, separator: str, option: str, example: str) -> tupl
 # In another format
 
 
-def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> list[str]:
+def convert_calibration(
+    found: Calibration, out: Path, form: str | None = None, fov_deg: float | None = None
+) -> list[str]:
     """Writes the calibration in a format, None: that of the name of ``out``; lines.
 
     Raises:
-        CalibrationError: it cannot be read, or that format has no such cameras.
+        CalibrationError: that format has no such cameras.
         OutputError: the file cannot be written.
     """
-    found = asked.read()
     lacking = [camera.name for camera in found.cameras if camera.width == 0]
     if lacking:
         raise CalibrationError(
             f"{found.source} does not state the images' size; give it: --size 640x480"
         )
-    words = write_calibration(found, out, form, asked.fov_deg)
+    words = write_calibration(found, out, form, fov_deg)
     return [f"{out}: {words}, {len(found.cameras)} cameras of {found.source}", *found.notes]
 
 
@@ -513,19 +510,20 @@ def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> lis
 # In words, and as a picture
 
 
-def show_calibration(asked: Asked, picture: Path | None) -> list[str]:
+def show_calibration(
+    found: Calibration, picture: Path | None, fov_deg: float | None = None
+) -> list[str]:
     """What was understood, in lines; the picture as well, where one is wanted.
 
     Raises:
-        CalibrationError: the calibration cannot be read.
+        CalibrationError: its cameras make no rig.
         OutputError: the picture cannot be written.
     """
-    found = asked.read()
     many = f"{len(found.cameras)} camera{'s' if len(found.cameras) > 1 else ''}"
     lines = [f"{found.source}: {found.format}, {many}", *_table(found)]
     rig = None
     if len(found.cameras) > 1:
-        rig = rig_of(found, asked.fov_deg)
+        rig = rig_of(found, fov_deg)
         lines += _about(rig, found)
     if picture is not None:
         _draw(found, rig, picture)

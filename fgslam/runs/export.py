@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -27,7 +27,6 @@ from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.sensors import (
     CAMERA_NAMES,
     CameraRig,
-    PoseFrame,
     body_is_camera,
     pixel_model,
     vertical_to_horizontal,
@@ -40,8 +39,6 @@ from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSett
 from fgslam.report.content import read_metrics
 from fgslam.report.formats import (
     GRAPH,
-    MCAP_SUFFIX,
-    Axes,
     ImageModel,
     MapPoints,
     PoseLandmarkGraph,
@@ -60,70 +57,9 @@ from fgslam.runs.opening import open_sequence
 from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.units import Progress
+from fgslam.runs.wanted import Wanted
 from fgslam.slam.build import chosen_estimator
 from fgslam.slam.replay import replay
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What to export: files and folders to write, None where not asked for.
-
-    Attributes:
-        map: landmarks, `.ply` or `.pcd`.
-        trajectory: poses, `.tum`, `.kitti`, `.csv` (EuRoC) or `.mcap` (ROS 2).
-        graph: measurements, poses and landmarks, `.g2o`.
-        images: folder for images with poses and points, for COLMAP.
-        frame: what the trajectory's poses are of; None: of what the recording's truth is, else of
-            the left camera.
-        axes: of trajectory and map; None for those of ROS next to an `.mcap`, else of cameras.
-        estimator: whose; None for the one that steered.
-        valid_only: only landmarks that were seen often enough to be trusted.
-        colour: the map in the images' colours, with normals.
-        dense: surface of all that the images show, as points, `.ply` or `.pcd`.
-        mesh: the same as triangles, `.ply`.
-        grid: Nav2's `.yaml`, its `.pgm` next to it.
-        how: the dense map is made.
-        recording: where the run's recording is now, None: where it was, or next to the run.
-        overwrite: replace files that are there.
-    """
-
-    map: Path | None = None
-    trajectory: Path | None = None
-    graph: Path | None = None
-    images: Path | None = None
-    frame: PoseFrame | None = None
-    axes: Axes | None = None
-    estimator: str | None = None
-    valid_only: bool = False
-    colour: bool = False
-    dense: Path | None = None
-    mesh: Path | None = None
-    grid: Path | None = None
-    how: DenseSettings = field(default_factory=DenseSettings)
-    recording: Path | None = None
-    overwrite: bool = False
-
-    @property
-    def files(self) -> list[Path]:
-        """Those to write."""
-        grid = (self.grid, self.grid and self.grid.with_suffix(".pgm"))
-        files = (self.map, self.trajectory, self.graph, self.dense, self.mesh, *grid)
-        return [path for path in files if path is not None]
-
-    @property
-    def is_dense(self) -> bool:
-        """Whether images are to be matched densely."""
-        return (self.dense, self.mesh, self.grid) != (None, None, None)
-
-    @property
-    def is_bag(self) -> bool:
-        """Whether the trajectory is for ROS 2."""
-        return self.trajectory is not None and self.trajectory.suffix.lower() == MCAP_SUFFIX
-
-    @property
-    def chosen_axes(self) -> Axes:
-        """Of trajectory and map, which lie in one world."""
-        return self.axes or ("ros" if self.is_bag else "camera")
 
 
 def export_run(
@@ -136,6 +72,7 @@ def export_run(
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
+    how = wanted.how
     _require_outputs(run, wanted)
     asked = bool(wanted.files or wanted.images)
     folder: Path | None = None  # of an estimator
@@ -170,7 +107,7 @@ def export_run(
         bare = folder is not None and wanted.trajectory.suffix.lower() == ".kitti"
         lines.append(saved_as + (line_numbers(trajectory, log()) if bare else ""))
     if wanted.is_dense:
-        found = dense_map(run, wanted.estimator, wanted.how, wanted.recording, progress, log())
+        found = dense_map(run, wanted.estimator, how, wanted.recording, progress, log())
         lines += save_dense(found, wanted, remark)
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines

@@ -444,7 +444,6 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
             for name, version in _section(provenance, "versions").items()
         },
         up=_up(find(LOG_FILE)),
-        alignment="after SE3 alignment",
         alarms=alarms(found, (steered or {}).get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
         stages=None if (file := find("timing.csv")) is None else _stages(file),

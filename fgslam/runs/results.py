@@ -11,6 +11,7 @@ import numpy as np
 from fgslam.core.files import make_subfolder
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import (
+    UNKNOWN,
     Column,
     Figure,
     Page,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 PICTURES = "pictures"
 VIEW = "view"
 """Beginning of the names of small pictures of the drive, before the row of its path."""
-UNKNOWN = "-"
 
 
 def finish(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,13 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import DatasetError
 from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import PoseFrame
 from fgslam.core.types import LAGS, Estimate, LandmarkMap, Trajectory, write_covariances
 from fgslam.evaluation.statistics import value_at
-from fgslam.report.content import Column, TextTable, write_csv
+from fgslam.report.content import UNKNOWN, Column, TextTable, write_csv
 from fgslam.report.formats import MapPoints, write_map
 from fgslam.slam.pipeline import FrameNoise
 from fgslam.slam.replay import Replay, ReplayRow
@@ -32,9 +30,6 @@ from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"
 NOISE_TABLE = "noise.csv"
-_VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)
-"""What makes a cell's text a value again."""
-
 _GREY = 128
 _VALID_HITS = 3  # Se et al. 6.1, where no front-end's own number is known
 
@@ -96,17 +91,6 @@ def write_frames(path: Path, timestamps: FloatArray, frames: Sequence[ReplayRow]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def read_frames(path: Path) -> list[ReplayRow]:
-    """The rows of a frames.csv. Raises DatasetError where it is none."""
-    try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-        return [ReplayRow(**{name: _VALUE[name](row[name]) for name in _VALUE}) for row in rows]
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not a frames.csv ({error}); run the experiment again"
-        ) from error
-
-
 def points_from_log(
     landmarks: LandmarkMap, log: MeasurementLog, look: MapPoints | None
 ) -> MapPoints:
@@ -139,7 +123,6 @@ def _counts(parts: list[IntArray], ids: IntArray) -> IntArray:
     return np.bincount(np.searchsorted(ids, every[np.isin(every, ids)]), minlength=len(ids))
 
 
-UNKNOWN = "-"
 _REMARKS_SHOWN = 3
 
 
@@ -167,12 +150,8 @@ class Metric(NamedTuple):
 
 RESULT, TIME, FURTHER, JUDGED = "result", "time", "further", "judged"
 _METRICS = tuple(Metric(*row) for row in (
-    ("kind", "kind", RESULT),
-    ("odometry", "odometry", RESULT),
-    ("frames", "frames", RESULT),
-    ("predicted_frames", "predicted_frames", RESULT),
-    ("alignment", "alignment", RESULT),
-    ("matched_poses", "matched_poses", RESULT),
+    *((name, name, RESULT) for name in (
+        "kind", "odometry", "frames", "predicted_frames", "alignment", "matched_poses")),
     ("ate_final_m", "ate_rmse_m", RESULT, "accuracy: ATE|final cm", "cm", "truth", "absolute "
      "trajectory error of the final path: rms distance from the truth after SE3 alignment"),
     ("ate_online_m", "online.ate_rmse_m", RESULT, "accuracy: ATE|online cm", "cm", "truth",
@@ -214,20 +193,12 @@ _METRICS = tuple(Metric(*row) for row in (
     ("nees_pose_best_per_dof", "nees_best.per_dof", RESULT, "consistency: best|aligned",
      "ratio", "truth", "the same of the final path, aligned where it is least"),
     ("nees_pose_best_verdict", "nees_best.verdict", RESULT),
-    ("nees_motion_1_per_dof", "nees_relative.1.per_dof", RESULT,
-     "consistency: NEES motions|1 5 20 frames", "ratio", "joint", "of motions over so many "
-     "frames, by the joint covariance of both poses"),
-    ("nees_motion_5_per_dof", "nees_relative.5.per_dof", RESULT,
-     "consistency: NEES motions|1 5 20 frames", "ratio", "joint"),
-    ("nees_motion_20_per_dof", "nees_relative.20.per_dof", RESULT,
-     "consistency: NEES motions|1 5 20 frames", "ratio", "joint"),
-    ("nees_motion_1_online", "online.nees_relative.1.per_dof", RESULT,
-     "consistency: motions online|1 5 20 frames", "ratio", "joint", "the same between poses as "
-     "first estimated"),
-    ("nees_motion_5_online", "online.nees_relative.5.per_dof", RESULT,
-     "consistency: motions online|1 5 20 frames", "ratio", "joint"),
-    ("nees_motion_20_online", "online.nees_relative.20.per_dof", RESULT,
-     "consistency: motions online|1 5 20 frames", "ratio", "joint"),
+    *((f"nees_motion_{lag}_per_dof", f"nees_relative.{lag}.per_dof", RESULT,
+       "consistency: NEES motions|1 5 20 frames", "ratio", "joint", "of motions over so many "
+       "frames, by the joint covariance of both poses") for lag in LAGS),
+    *((f"nees_motion_{lag}_online", f"online.nees_relative.{lag}.per_dof", RESULT,
+       "consistency: motions online|1 5 20 frames", "ratio", "joint", "the same between poses as "
+       "first estimated") for lag in LAGS),
     ("judged_poses", "judged_poses", RESULT),
     ("coverage_final", "coverage.all", RESULT, "consistency: in 2 sigma|final online", ".0%",
      "truth", "pose errors within two sigma; and of each pose as first estimated"),

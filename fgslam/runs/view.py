@@ -462,8 +462,9 @@ def _log(rerun: Any, stream: Any, data: ReportData) -> None:
         stream.set_time(TIMELINE, duration=data.estimators[0].timestamps[row] - data.start)
         stream.log("view", rerun.EncodedImage(contents=view, media_type="image/jpeg"))
     captions = "\n".join(f"{i:02d}: {picture.caption}" for i, picture in enumerate(data.pictures))
-    parts = [data.title, data.subtitle, *data.notes, *data.remarks, captions, data.config_yaml]
-    stream.log("about", rerun.TextDocument("\n\n".join(filter(None, parts))), static=True)
+    words = [data.title, data.subtitle, *data.notes, *data.remarks_of_all, captions]
+    text = "\n\n".join(filter(None, (*words, data.config_yaml)))
+    stream.log("about", rerun.TextDocument(text), static=True)
     # The map on the left; image, error with its band, consistency and words on the right.
     views = rerun.blueprint
     right = views.Vertical(

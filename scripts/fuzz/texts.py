@@ -12,7 +12,7 @@ from numpy.polynomial import polynomial
 
 from fgslam.datasets.odometry import file_odometry
 from fgslam.datasets.settings import RecordedOdometrySettings
-from fgslam.runs.calibrating import Asked, convert_calibration
+from fgslam.runs.calibrating import convert_calibration, read_calibration
 from fgslam.runs.named_experiments import experiment_names, experiments_folder
 from scripts.fuzz.damage import ODD, Rng, damaged_bytes, damaged_text, written
 
@@ -75,7 +75,7 @@ def _calibrations() -> tuple[dict[str, str], ...]:
         folder = Path(scratch)
         chain = written(folder / "chain.yaml", _CHAIN)
         for name in ("raw.json", "opencv.yml", "opencv.xml", "ros"):
-            convert_calibration(Asked(chain), folder / name)
+            convert_calibration(read_calibration(chain), folder / name)
         ros = {path.name: path.read_text("utf-8") for path in sorted((folder / "ros").iterdir())}
         files = sorted(path for path in folder.iterdir() if path.is_file())
         return ({"calib.json": CALIBRATION}, ros, *({p.name: p.read_text("utf-8")} for p in files))

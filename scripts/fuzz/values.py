@@ -16,7 +16,7 @@ import yaml
 
 import fgslam as fg
 from fgslam.cameras.lenses import Calibration
-from fgslam.runs.calibrating import Asked, convert_calibration
+from fgslam.runs import calibrating
 from fgslam.runs.config import load_experiment
 from fgslam.runs.named_experiments import experiment_names, experiments_folder
 from scripts.fuzz.damage import Rng, written
@@ -88,8 +88,8 @@ def read_calibration(given: tuple[Path, Path | None]) -> Pair:
         return np.array(list(values.values()), np.float64), np.array(found, np.float64)
     fg.load_rig(path)
     if other is not None:
-        convert_calibration(Asked(path), other)
-    return _said(yaml.safe_load(text)), _found(Asked(other or path).read())
+        calibrating.convert_calibration(calibrating.read_calibration(path), other)
+    return _said(yaml.safe_load(text)), _found(calibrating.read_calibration(other or path))
 
 
 def _said(chain: dict[str, dict[str, Any]]) -> np.ndarray[Any, Any]:

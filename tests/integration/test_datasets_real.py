@@ -27,9 +27,10 @@ from fgslam.datasets.settings import (
 )
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.runs.export import Wanted, export_run
+from fgslam.runs.export import export_run
 from fgslam.runs.findings import Level
 from fgslam.runs.inspect import check_sequence
+from fgslam.runs.wanted import Wanted
 from fgslam.slam.build import make_extractor
 from scripts.convert.light_field import convert
 

@@ -26,8 +26,9 @@ from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapErro
 from fgslam.core.saved_map import load_map, save_map
 from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
-from fgslam.runs.export import Wanted, export_run
+from fgslam.runs.export import export_run
 from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.wanted import Wanted
 
 CUT = 7
 EVERY = (

@@ -49,7 +49,7 @@ from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import FrontEndSettings
 from fgslam.homing.steering import Command, CorridorAvoidance, HomingState, Steering
 from fgslam.homing.topological_map import RouteMap
-from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
+from fgslam.report.content import UNKNOWN, Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (
     PASS_RADIUS_M,
     Drive,
@@ -61,7 +61,7 @@ from fgslam.report.homing_figures import (
 )
 from fgslam.runs.config import CrossroadsConfig, DrivingConfig, OmniVideoConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
-from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table
+from fgslam.runs.results import draw_picture, finish, median, numbers_table
 from fgslam.runs.tasks.homing_replay import replay_homing, save_bearing_logs
 
 if TYPE_CHECKING:

@@ -38,8 +38,8 @@ from fgslam.evaluation.localisation import (
 )
 from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.report.content import Column, Figure, TextTable, write_csv, write_json
-from fgslam.report.homing_figures import Located, located_figure
+from fgslam.report.content import UNKNOWN, Column, Figure, TextTable, write_csv
+from fgslam.report.homing_figures import located_figure
 from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import (
     ExperimentConfig,
@@ -51,7 +51,6 @@ from fgslam.runs.config import (
 )
 from fgslam.runs.engine import Context, LocatedShare, Opening, RunResult, Task, provenance_of
 from fgslam.runs.folder import (
-    METRICS_FILE,
     ExistingFolder,
     Owner,
     begin_folder,
@@ -59,7 +58,7 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.results import PICTURES, UNKNOWN, number_text, write_page
+from fgslam.runs.results import PICTURES, number_text, write_document, write_page
 from fgslam.runs.session import drives_of
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
@@ -558,16 +557,13 @@ def write_results(
     write_csv(folder / "localisation.csv", _COLUMNS, rows)
     timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in asked.attempts)
     write_csv(folder / "timing.csv", ("frame", "frames", "locate_ms", "frontend_ms"), timing)
-    document: dict[str, JsonValue] = {
-        "name": result.config.name,
-        "task": result.config.task,
-        "status": result.status,
+    numbers: dict[str, JsonValue] = {
         "landmarks": len(asked.landmarks),
         "alignment": asked.alignment,
         "notes": list(result.notes),
         "queries": {str(one.frames): one.numbers for one in judged},
     }
-    write_json(folder / METRICS_FILE, document)
+    write_document(result, numbers)
     bounds = bounds_of(result.config)
     figures = [_figure(given, one, bounds) for one in judged]
     if result.config.output.pictures:
@@ -612,17 +608,9 @@ def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
 def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
     answers, errors = judged.answers, judged.errors
     false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
-    located = Located(
-        landmarks=given.saved.landmarks.positions,
-        path=given.saved.trajectory.poses,
-        found=answers.accepted,
-        poses=answers.poses,
-        covariances=answers.covariances,
-        truth=answers.truth,
-        false=np.asarray(false),
-    )
-    title = f"Found from {in_frames(judged.frames)}"
-    return located_figure(located, f"localisation-{judged.frames}", title)
+    words = f"localisation-{judged.frames}", f"Found from {in_frames(judged.frames)}"
+    landmarks, path = given.saved.landmarks.positions, given.saved.trajectory.poses
+    return located_figure(words, landmarks, path, answers, np.asarray(false))
 
 
 # ------------------------------------------------------------------------------------------

@@ -12,14 +12,15 @@ from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementRecording, write_lan
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
-from fgslam.report.content import write_timing
+from fgslam.report.content import read_table, records, write_timing
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.report import count_spread
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
-from fgslam.runs.tables import FRAMES_FILE, read_frames
-from fgslam.slam.replay import ReplayRow
+from fgslam.runs.tables import FRAMES_FILE
+
+_NUMBERS = ("inliers", "solve_ms", "update_ms")
 
 
 def open_measured(config: ExperimentConfig, seed: int | None = None) -> MeasurementRecording:
@@ -47,14 +48,21 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
     metrics = replay_apart(config, folder, config.estimators, context)
     # Frame by frame, what the estimator of `estimator.kind` did; nothing where it gave none.
     path = folder / config.estimator.title / FRAMES_FILE
-    rows = read_frames(path) if path.is_file() else []
+    rows = records(read_table(path, _NUMBERS, ("status",))) if path.is_file() else []
     times = (
-        (increment.index, increment.timestamp, stage, milliseconds)
+        (increment.index, increment.timestamp, stage, row[column])
         for increment, row in zip(recording.log.increments, rows, strict=False)
-        for stage, milliseconds in (("track", row.solve_ms), ("update", row.update_ms))
+        for stage, column in (("track", "solve_ms"), ("update", "update_ms"))
     )
     write_timing(folder / "timing.csv", times)
-    about = _about(config, recording, rows)
+    about: dict[str, JsonValue] = {
+        "frames_in_recording": len(recording.log),
+        "odometry": config.odometry.kind,
+        "remark": config.remark or None,
+        "notes": list(recording.notes),
+        "status_counts": dict(sorted(Counter(row["status"] for row in rows).items())),
+        "landmark_matches": count_spread(np.array([row["inliers"] for row in rows[1:]], np.int64)),
+    }
     return write_comparison(context, config, len(recording.log), metrics, about, folder)
 
 
@@ -67,16 +75,3 @@ def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
     if recording.landmark_truth is not None:
         exact = np.zeros(len(recording.landmark_truth))
         write_landmark_truth(folder / LANDMARK_TRUTH_FILE, recording.landmark_truth, exact)
-
-
-def _about(
-    config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow]
-) -> dict[str, JsonValue]:
-    return {
-        "frames_in_recording": len(recording.log),
-        "odometry": config.odometry.kind,
-        "remark": config.remark or None,
-        "notes": list(recording.notes),
-        "status_counts": dict(sorted(Counter(row.status for row in rows).items())),
-        "landmark_matches": count_spread(np.array([row.inliers for row in rows[1:]], np.int64)),
-    }

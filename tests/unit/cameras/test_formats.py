@@ -18,7 +18,7 @@ from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.runs.calibrating import Asked, show_calibration
+from fgslam.runs.calibrating import read_calibration, show_calibration
 
 # --------------------------------------------------------------------------------------------
 # Files that people have; facts are those of the SOURCE.md next to them, found by other programs
@@ -97,7 +97,7 @@ def test_the_baseline_of_every_tools_file(files: Path, name: str) -> None:
 
 @pytest.mark.data
 def test_a_swapped_pair_of_ros_files_is_said_when_shown(files: Path) -> None:
-    lines = show_calibration(Asked(files / "camera_info/uby56_imx219_stereo"), None)
+    lines = show_calibration(read_calibration(files / "camera_info/uby56_imx219_stereo"), None)
     assert any(line.startswith("rig: right = left.yaml, left = right.yaml") for line in lines)
     assert any(
         "left and right are swapped: left.yaml, the left one by its name" in x for x in lines

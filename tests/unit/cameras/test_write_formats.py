@@ -14,7 +14,7 @@ from fgslam.cameras.rig import read_calibration_file
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.runs.calibrating import Asked, convert_calibration, show_calibration
+from fgslam.runs.calibrating import convert_calibration, read_calibration, show_calibration
 
 SIZE = (64, 48)
 STEP = pose(so3_exp(np.array([0.013, -0.021, 0.007])), np.array([0.1101, 0.0012, -0.0023]))
@@ -68,7 +68,7 @@ def test_what_is_written_is_read_back(
 def test_a_pair_for_ros_is_read_back(model: str, count: int, tmp_path: Path) -> None:
     parameters = [*PARAMETERS[model], 0.01, 0.02, 0.03, 0.04][:count]
     write_calibration(calibration(model, parameters), tmp_path / "a.json")
-    convert_calibration(Asked(tmp_path / "a.json"), tmp_path / "ros")
+    convert_calibration(read_calibration(tmp_path / "a.json"), tmp_path / "ros")
     found = read_calibration_file(tmp_path / "ros")
     for k, camera in enumerate(found.cameras):
         np.testing.assert_array_equal(camera.distortion, np.array(parameters) * (1.0 - 0.1 * k))
@@ -90,7 +90,7 @@ def test_five_formats_one_after_another(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / "0.yaml")
     names = ("0.yaml", "1.yml", "2.xml", "3", "4.json", "5.yaml")
     for before, after in pairwise(names):
-        convert_calibration(Asked(tmp_path / before), tmp_path / after)
+        convert_calibration(read_calibration(tmp_path / before), tmp_path / after)
     first, last = (read_calibration_file(tmp_path / name) for name in (names[0], names[-1]))
     np.testing.assert_array_equal(first.cameras[1].distortion, last.cameras[1].distortion)
     np.testing.assert_array_equal(first.cameras[1].matrix, last.cameras[1].matrix)
@@ -121,7 +121,7 @@ def test_what_a_format_cannot_hold_is_refused(
 
 def test_a_calibration_in_words_and_as_a_picture(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / "a.json")
-    lines = show_calibration(Asked(tmp_path / "a.json"), tmp_path / "a.png")
+    lines = show_calibration(read_calibration(tmp_path / "a.json"), tmp_path / "a.png")
     assert "calib.json of fgslam, 2 cameras" in lines[0]
     assert [line.split()[0] for line in lines[1:4]] == ["camera", "0:", "1:"]
     length = 1e3 * float(np.linalg.norm(STEP[:3, 3]))
@@ -132,7 +132,7 @@ def test_a_calibration_in_words_and_as_a_picture(tmp_path: Path) -> None:
 
 def test_black_borders_are_counted(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / "a.json")
-    lines = show_calibration(Asked(tmp_path / "a.json", fov_deg=60.0), None)
+    lines = show_calibration(read_calibration(tmp_path / "a.json"), None, 60.0)
     share = float(lines[5].split(" % of it")[0].rpartition(" ")[2])
     assert share < 50.0
 
@@ -143,13 +143,13 @@ def test_black_borders_are_counted(tmp_path: Path) -> None:
         ({"size": "wide"}, "--size wide: give whole numbers, as --size 640x480"),
         ({"size": "128x96"}, "is for images of 64x48 pixels, the images have 128x96"),
         ({"cameras": "0"}, "give two or three of 0 to 1"),
-        ({"fov_deg": 190.0}, "perspective view takes 0 to 170"),
+        ({"fov": 190.0}, "perspective view takes 0 to 170"),
     ],
 )
 def test_wrong_options(asked: dict[str, object], words: str, tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / "a.json")
     with pytest.raises(FgslamError, match=words):
-        show_calibration(Asked(tmp_path / "a.json", **asked), None)  # type: ignore[arg-type]
+        show_calibration(read_calibration(tmp_path / "a.json", **asked), None)  # type: ignore[arg-type]
 
 
 def test_millimetres_are_noticed_and_mended(tmp_path: Path) -> None:
@@ -157,9 +157,9 @@ def test_millimetres_are_noticed_and_mended(tmp_path: Path) -> None:
     far = pose(STEP[:3, :3], 1e3 * STEP[:3, 3])
     cameras[1] = RawCamera(*SIZE, cameras[1].matrix, cameras[1].distortion, far, "c")
     write_calibration(Calibration("made", "made", tuple(cameras)), tmp_path / "a.yaml")
-    said = show_calibration(Asked(tmp_path / "a.yaml"), None)
+    said = show_calibration(read_calibration(tmp_path / "a.yaml"), None)
     assert "the baseline is 110.1 m; if its unit is not the metre, give it" in said[-1]
-    mended = show_calibration(Asked(tmp_path / "a.yaml", unit_m=0.001), None)
+    mended = show_calibration(read_calibration(tmp_path / "a.yaml", unit=0.001), None)
     assert "baseline 110.13 mm" in mended[4]
     assert len(mended) == len(said) - 1
 
@@ -167,6 +167,6 @@ def test_millimetres_are_noticed_and_mended(tmp_path: Path) -> None:
 def test_one_camera_has_no_rig(tmp_path: Path) -> None:
     alone = Calibration("made", "made", calibration().cameras[:1])
     write_calibration(alone, tmp_path / "a.json")
-    lines = show_calibration(Asked(tmp_path / "a.json"), None)
+    lines = show_calibration(read_calibration(tmp_path / "a.json"), None)
     assert "1 camera" in lines[0]
     assert len(lines) == 3

@@ -6,18 +6,17 @@ import io
 
 from rich.console import Console
 
-from fgslam.cli.console import Display, fitting_tables
+from fgslam.cli.console import fitting_tables, progress_bar
 from fgslam.report.content import Column, TextTable
 
 
 def test_progress_says_how_many_cases_are_done_and_the_time_left() -> None:
     now, out = [100.0], io.StringIO()
     console = Console(file=out, width=120, get_time=lambda: now[0])
-    shown = Display(console)
-    for done in range(5):
-        shown.tell("cases", done, 20)
-        now[0] += 30.0
-    shown.close()
+    with progress_bar(console) as tell:
+        for done in range(5):
+            tell("cases", done, 20)
+            now[0] += 30.0
     # 30 seconds a case, 16 are left: 8 minutes.
     said = out.getvalue()
     assert "4/20" in said
@@ -47,5 +46,6 @@ def test_a_table_is_parted_where_its_words_would_be_cut() -> None:
 
 def test_nothing_is_drawn_without_a_stage() -> None:
     out = io.StringIO()
-    Display(Console(file=out)).close()
+    with progress_bar(Console(file=out)):
+        pass
     assert not out.getvalue()

@@ -45,7 +45,7 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare import bare_experiment
-from fgslam.runs.calibrating import Asked, convert_calibration
+from fgslam.runs.calibrating import convert_calibration, read_calibration
 from fgslam.runs.inspect import check_odometry
 
 # --------------------------------------------------------------------------------------------
@@ -232,7 +232,7 @@ def test_the_images_may_be_compressed_that_a_camchain_names(tmp_path: Path) -> N
     file = camchain(tmp_path, {"left": "/x/image_raw", "right": "y/image_raw"})
     assert codes(opened(path, camera_file=file), 0) == (10, 60)
     written = tmp_path / "again.yaml"
-    convert_calibration(Asked(Path(file)), written)
+    convert_calibration(read_calibration(Path(file)), written)
     assert codes(opened(path, camera_file=str(written)), 0) == (10, 60)
 
 

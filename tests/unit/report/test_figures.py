@@ -53,7 +53,7 @@ def two(sigma_m: float, covariances: FloatArray | None = None) -> ReportData:
     other = estimator_report("other", truth, rng, sigma_m=sigma_m)
     if covariances is not None:
         other = dataclasses.replace(other, covariances=covariances)
-    return ReportData("", "", (good, other), truth)
+    return ReportData("", "", estimators=(good, other), truth=truth)
 
 
 # --------------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def test_far_landmarks_lie_outside_the_map() -> None:
 def test_the_map_of_the_best_estimator_is_shown_first() -> None:
     assert full_report().best == 1
     assert without_truth(full_report()).best == 0
-    assert ReportData("t", "", ()).best == 0
+    assert ReportData("t", "", estimators=()).best == 0
     landmarks = {name for name in shown(map_to_turn(full_report())) if "landmarks" in name}
     assert landmarks == {"landmarks of isam2"}
 
@@ -291,7 +291,7 @@ def test_a_long_drive_is_moved_along_in_few_steps() -> None:
     assert drive is not None
     assert len(drive.seconds) == drive.places.shape[1] == 300
     assert drive.views == {0: b"first", 299: b"last"}
-    assert drive_along(ReportData("t", "", ())) is None
+    assert drive_along(ReportData("t", "", estimators=())) is None
 
 
 def test_cost_by_stage_holds_all_but_waiting() -> None:

@@ -63,7 +63,7 @@ def drive(n: int, *, full: bool) -> ReportData:
     landmarks = LandmarkMap(np.arange(n), points, np.zeros((n, 3, 3)))
     estimate = Estimate(path, np.full((len(poses), 6, 6), np.nan), landmarks)
     report = judged_report("a", "a", estimate, None, path if full else None)
-    return ReportData("drive", "", (report,), path if full else None)
+    return ReportData("drive", "", estimators=(report,), truth=path if full else None)
 
 
 def all_overlays(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:

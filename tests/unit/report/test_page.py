@@ -83,7 +83,7 @@ def sentences(*estimators: tuple[str, float | None, float | None, str | None]) -
         )
         for title, ate, nees, verdict in estimators
     )
-    return headline(ReportData("t", "", reports, truth))
+    return headline(ReportData("t", "", estimators=reports, truth=truth))
 
 
 def test_the_best_is_named_with_its_lead() -> None:
@@ -114,7 +114,7 @@ def test_truth_that_is_left_out_is_stated_once() -> None:
         dataclasses.replace(estimator_report(title, truth, rng), truth_remark=why)
         for title in ("isam2", "batch")
     )
-    lines = headline(ReportData("t", "", reports, truth))
+    lines = headline(ReportData("t", "", estimators=reports, truth=truth))
     assert [line for line in lines if "0 to 10" in line] == [f"T{why[1:]}."]
 
 
@@ -134,7 +134,7 @@ def test_unknown_values_are_stated() -> None:
     lines = headline(without_truth(full_report()))
     assert lines[0] == "How accurate the path is, is not known: there is no ground truth."
     assert lines[-1] == "ekf failed: the map of 4,000 landmarks needs 1.2 GB"
-    assert headline(ReportData("t", "", ())) == ("No estimator gave a result.",)
+    assert headline(ReportData("t", "", estimators=())) == ("No estimator gave a result.",)
 
 
 # --------------------------------------------------------------------------------------------
@@ -174,7 +174,7 @@ def test_everything_from_outside_is_escaped() -> None:
         ReportData(
             HOSTILE,
             HOSTILE,
-            (
+            estimators=(
                 dataclasses.replace(data.estimators[0], title="x" + HOSTILE, remarks=(HOSTILE,)),
                 failed,
             ),
@@ -220,7 +220,7 @@ def test_long_runs_stay_small() -> None:
     rng, truth = np.random.default_rng(5), loop(2500)
     reports = tuple(estimator_report(f"e{i}", truth, rng, landmarks=20_000) for i in range(8))
     noise = Picture("noise", picture(rng, 1400, 1300))
-    text = render(ReportData("long", "", reports, truth, pictures=(noise,) * 5))
+    text = render(ReportData("long", "", estimators=reports, truth=truth, pictures=(noise,) * 5))
     assert len(text.encode()) < 8e6
     left_out = "Left out to keep this page small, see the run folder: noise"
     assert left_out in text  # pictures at their worst
@@ -235,7 +235,7 @@ def test_rows_and_shapes_must_agree() -> None:
     with pytest.raises(ValueError, match=r"landmark_kalman: nees has 3 rows, not 60"):
         dataclasses.replace(report, nees=np.zeros(3))
     with pytest.raises(ValueError, match="not unique"):
-        ReportData("t", "", (report, report))
+        ReportData("t", "", estimators=(report, report))
 
 
 # --------------------------------------------------------------------------------------------

@@ -16,6 +16,8 @@ from matplotlib.image import imread
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import se3_exp
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory
+from fgslam.evaluation.localisation import Answers
+from fgslam.report.content import Figure
 from fgslam.report.figures import (
     LANDMARK_ELLIPSES,
     drive_from_above,
@@ -23,7 +25,7 @@ from fgslam.report.figures import (
     map_to_turn,
     matches_over_time,
 )
-from fgslam.report.homing_figures import Located, located_figure
+from fgslam.report.homing_figures import located_figure
 from fgslam.report.pictures import draw_figure, draw_views
 from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.tables import picture_title
@@ -47,10 +49,10 @@ def results(n: int, frames: int, *, full: bool) -> ReportData:
     landmarks = LandmarkMap(np.arange(n), positions, np.tile(unknown, (n, 1, 1)))
     truth = path if full and frames else None
     report = judged_report("a", "a", Estimate(path, covariances, landmarks), None, truth)
-    return ReportData("", "", (report,), truth)
+    return ReportData("", "", estimators=(report,), truth=truth)
 
 
-def located(n: int) -> Located:
+def located(n: int) -> Figure:
     """Every second query is found, the last of them somewhere else."""
     poses = results(n, n, full=True).estimators[0].final_poses
     found = np.arange(n) % 2 == 0
@@ -58,7 +60,9 @@ def located(n: int) -> Located:
     covariances = np.tile(1e-4 * np.eye(6), (n, 1, 1))
     drive = np.tile(np.eye(4), (2, 1, 1))
     drive[1, 2, 3] = 5.0
-    return Located(np.zeros((n, 3)), drive, found, poses, covariances, poses, false)
+    in_view = np.full(n, -1)
+    answers = Answers(found, poses, covariances, poses, in_view, in_view)
+    return located_figure(("k", "Found"), np.zeros((n, 3)), drive, answers, false)
 
 
 def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
@@ -72,7 +76,7 @@ def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
         "views": lambda p: draw_views(p, map_to_turn(results(n, n, full=full)), "Map"),
         "errors": lambda p: draw_figure(p, error_by_axis(results(n, n, full=full)), "Errors"),
         "matches": lambda p: draw_figure(p, matches_over_time(counted), "Matches"),
-        "located": lambda p: draw_figure(p, located_figure(located(n), "k", "Found"), "Found"),
+        "located": lambda p: draw_figure(p, located(n), "Found"),
     }
 
 
@@ -139,5 +143,5 @@ def test_what_a_page_hides_at_first_is_printed_where_it_is_named(tmp_path: Path)
 
 
 def test_located_poses_refusals_and_false_ones_differ() -> None:
-    names = [t.name for t in located_figure(located(8), "k", "Found").drawing.data]
+    names = [t.name for t in located(8).drawing.data]
     assert {"found", "found, but false", "refused", "to the true pose"} <= set(names)
