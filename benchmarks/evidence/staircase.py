@@ -81,5 +81,6 @@ def _replayed(name: str, settings: EstimatorSettings) -> tuple[Cell, ...]:
         centimetres(value_at(more, "online.ate_rmse_m")), centimetres(metrics.ate_rmse_m),
         value_at(more, "online.nees_pose_per_dof"), metrics.nees_pose_per_dof,
         value_at(more, "nees_relative.20.per_dof"), 1e3 * spent / max(len(played), 1),
-        played.peak_memory_mb - (played.memory_before_mb or 0.0), len(played), played.failure,
+        (played.peak_memory_mb or 0.0) - (played.memory_before_mb or 0.0), len(played),
+        played.failure,
     )  # fmt: skip

@@ -205,6 +205,14 @@ def thinned(count: int, limit: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
 
 
+def nearest_rows(stamps: npt.NDArray[Any], at: npt.NDArray[Any]) -> IntArray:
+    """Row of the increasing stamps (n,), n >= 1, nearest to each of ``at`` (m,)."""
+    after = np.clip(np.searchsorted(stamps, at), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamps[before] - at) <= np.abs(stamps[after] - at)
+    return np.asarray(np.where(closer, before, after), np.int64)
+
+
 def chi_square_quantile(probability: ArrayLike, dof: ArrayLike) -> FloatArray:
     """Values that a chi-square variable of ``dof`` degrees stays below with that probability."""
     from scipy.special import gammaincinv  # light modules do not load SciPy

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -734,3 +736,35 @@ class Estimate(Brief):
             relative=relative,
             online_relative=online,
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
+class Outcome(Brief, ABC):
+    """What an estimator made of a drive, live or of its log: what it is evaluated by.
+
+    Attributes:
+        kind: which estimator it is.
+        estimate: trajectory, covariances and landmarks as known now, or at the end (of what was
+            computed, on failure).
+        online: each pose as it was first estimated, at its own time.
+        online_covariances: (n, 6, 6) of those.
+        closed: of the loop closures offered so far, in their order, whether it took them.
+        failure: empty, or at which frame and why the estimator ended early.
+        final_ms: time for the final estimate after the last frame; NaN where not timed apart.
+        memory_before_mb: resident memory of the process before the estimator was made.
+        peak_memory_mb: its largest since the process began, the final estimate included.
+    """
+
+    kind: str
+    estimate: Estimate
+    online: Trajectory
+    online_covariances: FloatArray
+    closed: tuple[bool, ...] = ()
+    failure: str = ""
+    final_ms: float = math.nan
+    memory_before_mb: float | None = None
+    peak_memory_mb: float | None = None
+
+    @abstractmethod
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """(n,) one number of every frame: `status`, `nis`, `nis_dof`, `update_ms`, `solve_ms`."""

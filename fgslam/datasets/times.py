@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, nearest_rows
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import rotation_from_quaternion
@@ -235,14 +235,6 @@ TOLERANCE_S = 0.02
 """Largest difference in time of the images of one moment."""
 
 _NAMED_SKEW_S = 1e-3  # what synchronised cameras differ by at most
-
-
-def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
-    """Row of the increasing stamps (n,), n >= 1, nearest to each of ``at`` (m,)."""
-    after = np.clip(np.searchsorted(stamps, at), 0, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(stamps[before] - at) <= np.abs(stamps[after] - at)
-    return np.asarray(np.where(closer, before, after), np.int64)
 
 
 def pair_stamps(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, student_quantile
 from fgslam.core.checks import require_flag
@@ -15,7 +14,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import inverse, transform_to_world
 from fgslam.core.log import LandmarkTruth, MeasurementLog
 from fgslam.core.sensors import CameraRig, LoopClosure, PoseFrame
-from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
+from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, Outcome, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Consistency,
@@ -82,59 +81,6 @@ class Truth:
         return replace(self, trajectory=self.trajectory.of("right", self.rig))
 
 
-class Replayed(Protocol):
-    """What is evaluated of a replayed measurement log, as ``fgslam.slam.replay.Replay`` has it."""
-
-    @property
-    def kind(self) -> str:
-        """Which estimator it is."""
-        ...
-
-    @property
-    def estimate(self) -> Estimate:
-        """Trajectory, covariances and map as known at the end."""
-        ...
-
-    @property
-    def online(self) -> Trajectory:
-        """Each pose as first estimated."""
-        ...
-
-    @property
-    def online_covariances(self) -> FloatArray:
-        """(n, 6, 6) of those."""
-        ...
-
-    @property
-    def closed(self) -> tuple[bool, ...]:
-        """Of the loop closures offered, in order, whether each was taken."""
-        ...
-
-    @property
-    def failure(self) -> str:
-        """Why it ended early; else empty."""
-        ...
-
-    @property
-    def final_ms(self) -> float:
-        """Milliseconds for the final estimate."""
-        ...
-
-    @property
-    def memory_before_mb(self) -> float | None:
-        """Resident memory before the estimator was made, mebibytes."""
-        ...
-
-    @property
-    def peak_memory_mb(self) -> float | None:
-        """Its largest, mebibytes."""
-        ...
-
-    def column(self, name: str) -> npt.NDArray[Any]:
-        """(n,) one number of every frame: `nis`, `nis_dof`, `update_ms`, `solve_ms`."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
     """Result of an estimator, live or replayed; row k of every array is frame k.
@@ -159,7 +105,7 @@ class Answer:
     predicted: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @staticmethod
-    def of(replay: Replayed) -> Answer:
+    def of(replay: Outcome) -> Answer:
         """The answer of a replay."""
         statuses = replay.column("status").tolist()
         return Answer(
@@ -276,7 +222,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     )
 
 
-def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
+def judge_replay(replay: Outcome, truth: Truth) -> Judgement:
     """As :func:`judge_answer`, with what only a replay knows."""
     judged = judge_answer(Answer.of(replay), truth)
     metrics = judged.metrics
@@ -442,7 +388,7 @@ def landmark_errors(
     return distances, landmark_nees(positions, landmarks.covariances[rows], true)
 
 
-Comparable: TypeAlias = Replayed | Answer | Estimate
+Comparable: TypeAlias = Outcome | Answer | Estimate
 """A replayed log, an :class:`~fgslam.evaluation.judging.Answer`, or an estimate alone."""
 
 COLUMNS: tuple[tuple[str, str], ...] = (

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile
+from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile, nearest_rows
 from fgslam.core.geometry import adjoint, inverse, pose, se3_exp, se3_log, yaw_pitch_roll
 from fgslam.core.types import Trajectory
 
@@ -77,22 +77,13 @@ def associate(
     """
     if len(estimate_times) == 0 or len(truth_times) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    to_truth = _nearest(truth_times, estimate_times)
-    to_estimate = _nearest(estimate_times, truth_times)
+    to_truth = nearest_rows(truth_times, estimate_times)
+    to_estimate = nearest_rows(estimate_times, truth_times)
     rows = np.arange(len(estimate_times))
     mutual = to_estimate[to_truth] == rows
     near = np.abs(truth_times[to_truth] - estimate_times) <= tolerance_s
     keep = mutual & near
     return rows[keep], to_truth[keep]
-
-
-def _nearest(sorted_values: FloatArray, queries: FloatArray) -> IntArray:
-    """Index of the nearest of ``sorted_values`` to each query; the earlier one of a tie."""
-    right = np.clip(np.searchsorted(sorted_values, queries), 1, max(len(sorted_values) - 1, 1))
-    right = np.minimum(right, len(sorted_values) - 1)
-    left = np.maximum(right - 1, 0)
-    closer_left = queries - sorted_values[left] <= sorted_values[right] - queries
-    return np.asarray(np.where(closer_left, left, right), dtype=np.int64)
 
 
 # --------------------------------------------------------------------------------------------

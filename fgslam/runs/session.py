@@ -347,17 +347,11 @@ Overrides = Mapping[str, Any] | Iterable[str]
 """Settings by dotted key, {"seed": 3, "frontend.sift.max_features": 500}; or as texts "seed=3"."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Result(SessionResult):
     """Everything that a session knows at one moment: trajectory, covariances, map, remarks.
 
     Attributes:
-        kind: the estimator.
-        estimate: trajectory, pose covariances and landmarks as known now.
-        online: each pose as it was first estimated, at its own time.
-        online_covariances: (n, 6, 6) of those.
-        closed: of all loop closures offered so far, whether the estimator took them.
-        frames: the record of every frame, by name of the column.
         map: landmarks with covariances and appearance, to save or to find oneself in.
         log: the session's measurements; it grows where tracking goes on.
         cameras: the session's.

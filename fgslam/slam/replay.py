@@ -62,38 +62,20 @@ class ReplayRow(NamedTuple):
     solve_ms: float
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
 class Replay(Answered):
     """Result of an estimator on a replayed log.
 
     Attributes:
         title: the estimator's name in tables and folders.
-        kind: which estimator it is.
-        online: each pose as it was first estimated, at its own time.
-        online_covariances: (n, 6, 6) of those.
-        estimate: trajectory, covariances and map at the end (of what was computed, on failure).
         rows: one for each frame; ``update_ms`` is prediction and update, ``solve_ms`` the
             least-squares pose that all estimators share.
-        final_ms: time for the final estimate after the last frame.
-        memory_before_mb: resident memory of this process before the estimator was made.
-        peak_memory_mb: its largest since the process began, the final estimate included.
-        failure: empty, or at which frame and why the estimator ended early.
-        closed: of the log's loop closures so far, in their order, whether it took them.
         noise: that each frame was estimated with.
         estimator: as it is after the last frame; None where it could not be made.
     """
 
     title: str
-    kind: str
-    online: Trajectory
-    online_covariances: FloatArray
-    estimate: Estimate
     rows: tuple[ReplayRow, ...]
-    final_ms: float
-    memory_before_mb: float | None
-    peak_memory_mb: float
-    failure: str = ""
-    closed: tuple[bool, ...] = ()
     noise: tuple[FrameNoise, ...] = ()
     estimator: Estimator | None = dataclasses.field(default=None, repr=False)
 

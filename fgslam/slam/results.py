@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +20,7 @@ from fgslam.core.types import (
     NO_LANDMARKS,
     EgoMotionStatus,
     Estimate,
+    Outcome,
     Remark,
     StereoFeatures,
     Trajectory,
@@ -230,11 +230,10 @@ class Step(Brief):
         )
 
 
-class Answered(Brief):
+class Answered(Outcome):
     """The parts that results of sessions and of replays share."""
 
     __slots__ = ()
-    estimate: Estimate
     estimator: Estimator | None
 
     @property
@@ -263,16 +262,11 @@ class Answered(Brief):
         return found
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
 class SessionResult(Answered):
     """Everything that a session knows at one moment.
 
     Attributes:
-        kind: the estimator.
-        estimate: trajectory, pose covariances and landmarks as known now.
-        online: each pose as it was first estimated, at its own time.
-        online_covariances: (n, 6, 6) of those.
-        closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
         notes: remarks on frames, cameras and images, and on frames left out.
         rig: what the drive shows of the rig's calibration: estimated, with its covariance, and
@@ -280,21 +274,10 @@ class SessionResult(Answered):
         estimator: of whom all this is known.
     """
 
-    kind: str
-    estimate: Estimate
-    online: Trajectory
-    online_covariances: FloatArray
-    closed: tuple[bool, ...]
     frames: dict[str, npt.NDArray[Any]]
     notes: tuple[Remark | str, ...]
     rig: WeighedCorrection | None
     estimator: Estimator | None = field(repr=False)
-
-    # What a comparison of estimators asks of a replay, and a live session does not know.
-    failure = ""
-    final_ms = math.nan
-    memory_before_mb = None
-    peak_memory_mb = None
 
     @property
     def remarks(self) -> tuple[Remark | str, ...]:

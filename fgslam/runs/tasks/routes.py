@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, nearest_rows
 from fgslam.core.bearings import OmniFeatures
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError, FrameError
 from fgslam.core.geometry import wrap
 from fgslam.core.types import Trajectory, read_covariances
 from fgslam.datasets.omni import OmniRecording, camera_notes
 from fgslam.datasets.opening import open_checked, open_omni
-from fgslam.datasets.times import covered, interpolate_poses, nearest_rows
+from fgslam.datasets.times import covered, interpolate_poses
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.homing.api import PathFollower
 from fgslam.homing.links import Pair
