@@ -14,7 +14,7 @@ from fgslam.core.arrays import Brief, Float32, FloatArray, Image, IntArray, Rows
 from fgslam.core.checks import is_finite_number
 from fgslam.core.correction import term_names
 from fgslam.core.errors import DatasetError, MeasurementLogError
-from fgslam.core.files import write_text
+from fgslam.core.files import read_text, write_text
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import (
     NO_CAMERA,
@@ -26,7 +26,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.settings import RigPlaces
 from fgslam.core.store import FileKind, require_ascending, require_covariances, require_finite
-from fgslam.core.types import Trajectory
+from fgslam.core.types import Trajectory, parse_rows
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -337,26 +337,17 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
     Raises:
         DatasetError: the file is missing or is no such table; the message names the line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"cannot read {path} ({error}); run the experiment again") from error
-    if not lines or lines[0] != _HEADER:
+    header, _, rows = read_text(path, remedy="run the experiment again").partition("\n")
+    if header != _HEADER:
         raise DatasetError(f"{path}, line 1: not '{_HEADER}'; run the experiment again")
-    ids, values = np.empty(len(lines) - 1, np.int64), np.empty((len(lines) - 1, 4))
-    for k, line in enumerate(lines[1:]):
-        try:
-            first, *numbers = line.split(",")
-            ids[k], values[k] = int(first), [float(number) for number in numbers]
-        except ValueError as error:
-            raise DatasetError(
-                f"{path}, line {k + 2}: {error}; run the experiment again"
-            ) from error
-    if not (np.isfinite(values).all() and (np.diff(ids) > 0).all()):
+    expected = f"{_HEADER}, as the experiment writes it again"
+    values, _ = parse_rows(path, "\n" + rows.replace(",", " "), 5, expected)
+    if not (np.isfinite(values).all() and (np.diff(values[:, 0]) > 0.0).all()):
         raise DatasetError(
             f"{path}: ids do not increase or a number is not finite; run the experiment again"
         )
-    return LandmarkTruth(ids, values[:, :3].copy()), values[:, 3].copy()
+    truth = LandmarkTruth(values[:, 0].astype(np.int64), values[:, 1:4].copy())
+    return truth, values[:, 4].copy()
 
 
 # ------------------------------------------------------------------------------------------

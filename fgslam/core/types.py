@@ -382,9 +382,8 @@ class Trajectory(Brief):
         poses = np.empty((len(values), 4, 4))
         for out, row in zip(poses, values, strict=True):
             out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
-        named = (replace(Trajectory(values[:, 0].copy(), poses), frame=frame) for frame in _NAMED)
-        found = {one.frame: one for one in named if f"# {one.named}" in text}
-        return next(iter(found.values()), Trajectory(values[:, 0].copy(), poses))
+        stated = (f for f, names in _NAMED.items() if "# {}: pose of the {}".format(*names) in text)
+        return Trajectory(values[:, 0].copy(), poses, next(stated, "right"))
 
 
 def pose_rows(poses: FloatArray, decimals: int | None = None) -> FloatArray:

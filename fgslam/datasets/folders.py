@@ -27,7 +27,7 @@ from fgslam.datasets.images import (
     require_folder,
 )
 from fgslam.datasets.layouts import files_of, find_cameras, images_in
-from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
+from fgslam.datasets.ledger import IMAGES, PAIRING, Entry
 from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
@@ -35,6 +35,7 @@ from fgslam.datasets.recording import (
     loaded_rig,
     mounted,
     numbered,
+    numbered_frames,
     rig_of_views,
 )
 from fgslam.datasets.settings import (
@@ -71,15 +72,7 @@ def open_image_folder(
         calibration = Path(settings.camera_file)
     rig = _folder_rig(root, settings, calibration, cameras)
     numbers, stamps = _read_times(root / "times.txt")
-    # An absent image gets the name that it should have.
-    suffixes = {folder: next(iter(found.values())).suffix for folder, found in cameras.items()}
-    files = [
-        tuple(
-            found.get(number, folder / f"{number:06d}{suffixes[folder]}")
-            for folder, found in cameras.items()
-        )
-        for number in numbers.tolist()
-    ]
+    files, listed, ledger = numbered_frames(cameras, numbers.tolist(), root / "times.txt")
     images, noticed = open_frames(files, rig, root)
     known = set(numbers.tolist())
     unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
@@ -92,13 +85,7 @@ def open_image_folder(
             "calib.json states a vertical baseline but there is no top/: read as two cameras"
         )
     present = [path for path in (calibration,) if path.is_file()]
-    listed = (path for found in cameras.values() for path in found.values())
     defined = [*present, root / "times.txt"], listed
-    ledger = (
-        Entry(IMAGES, ", ".join(f"{k}/" for k in unlisted), "names of folders"),
-        Entry(TIMES, "stamps", str(root / "times.txt")),
-        Entry(PAIRING, "by number", "names of the images"),
-    )
     all_notes = (*noticed, *notes)
     return folder_recording(
         settings, odometry, root, rig, stamps, images, defined, all_notes, ledger=ledger

@@ -28,13 +28,14 @@ from fgslam.core.sensors import body_is_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
-from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
+from fgslam.datasets.ledger import IMAGES, TIMES, Entry
 from fgslam.datasets.odometry import SPEED_COLUMNS, gyroscope_odometry, motions_of, recorded_motions
 from fgslam.datasets.recording import (
     Recording,
     image_recording,
     loaded_rig,
     mounted,
+    numbered_frames,
     read_rig,
     with_truth,
 )
@@ -186,17 +187,12 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
             f"{folder} has no {lacking}/: unpack both grey cameras (image_0 left, image_1 "
             "right), or both colour cameras (image_2 left, image_3 right), there"
         )
-    cameras = {
-        name: list_numbered_images(folder / name)
-        for name in (f"image_{pair[1]}", f"image_{pair[0]}")
-    }
+    sides = (folder / f"image_{pair[1]}", folder / f"image_{pair[0]}")
+    cameras = {side: list_numbered_images(side) for side in sides}
     table = read_table(times, ("time",))
     stamps = table.values[:, 0]
     require_increasing(table, stamps)
-    paths = [
-        tuple(found.get(k, folder / name / f"{k:06d}.png") for name, found in cameras.items())
-        for k in range(len(stamps))
-    ]
+    paths, listed, ledger = numbered_frames(cameras, range(len(stamps)), times)
     size = first_size(frame[0] for frame in paths)  # which calib.txt does not state
     if size is None:
         raise DatasetError(
@@ -204,13 +200,7 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
         )
     rig = load_rig(calibration, size=size)
     images, noticed = open_frames(paths, rig, folder)
-    listed = [path for found in cameras.values() for path in found.values()]
     name, files = f"KITTI {settings.sequence}", ([calibration, times], listed)
-    ledger = (
-        Entry(IMAGES, ", ".join(f"{name}/" for name in cameras), "names of folders"),
-        Entry(TIMES, "stamps", str(times)),
-        Entry(PAIRING, "by number", "names of the images"),
-    )
     recording = image_recording(settings, name, rig, stamps, images, files, noticed, ledger)
     poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
     if poses is None:

@@ -22,7 +22,7 @@ from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import DepthLoader, ImageLoader, shown_together
-from fgslam.datasets.ledger import LENGTH, ODOMETRY, Entry
+from fgslam.datasets.ledger import IMAGES, LENGTH, ODOMETRY, PAIRING, TIMES, Entry
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
     OdometrySource,
@@ -166,6 +166,30 @@ def image_recording(
     more |= {"rectifier": rectifier, "ledger": ledger, "calibration": getattr(rig, "file", "")}
     identity = recording_identity(*files)
     return Recording(name, plain, stamps[indices], identity, notes, indices, load_images, **more)
+
+
+def numbered_frames(
+    cameras: Mapping[Path, Mapping[int, Path]], numbers: Iterable[int], times: Path
+) -> tuple[list[tuple[Path, ...]], list[Path], tuple[Entry, ...]]:
+    """Files of each frame, all files, and what is taken to be so, where numbers name images.
+
+    Args:
+        cameras: by folder the images by number; an absent one gets the name that it should have.
+        numbers: of the frames.
+        times: the file that lists them.
+    """
+    suffixes = [next((p.suffix for p in found.values()), ".png") for found in cameras.values()]
+    named = list(zip(cameras.items(), suffixes, strict=True))
+    files = [
+        tuple(found.get(k, folder / f"{k:06d}{suffix}") for (folder, found), suffix in named)
+        for k in numbers
+    ]
+    ledger = (
+        Entry(IMAGES, ", ".join(f"{folder.name}/" for folder in cameras), "names of folders"),
+        Entry(TIMES, "stamps", str(times)),
+        Entry(PAIRING, "by number", "names of the images"),
+    )
+    return files, [path for found in cameras.values() for path in found.values()], ledger
 
 
 TRUTH_RIGHT, TRUTH_LEFT = "gt_right_cam.txt", "gt_left_cam.txt"

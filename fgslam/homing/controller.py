@@ -409,6 +409,7 @@ class HomingChain:
     where the robot stands: images are sparse, but often two are in reach.
 
     Attributes:
+        target: number of the target image that is aimed at, or was last.
         outcomes: of the legs that ended.
         controller: of the present leg.
     """
@@ -456,11 +457,6 @@ class HomingChain:
         return command
 
     @property
-    def target(self) -> int:
-        """Number of the target image that is aimed at, or was last."""
-        return self._target
-
-    @property
     def given_up(self) -> bool:
         """Whether the path ended in a refusal."""
         return self._ended is not None and self._ended.state is HomingState.REFUSED
@@ -483,7 +479,7 @@ class HomingChain:
 
     def _go_on(self, command: Command) -> bool:
         """Notes how the leg ended and begins the next one; False at the path's end."""
-        last = self._target + 1 == len(self._path)
+        last = self.target + 1 == len(self._path)
         result: LegResult = "arrived"
         if command.state is not HomingState.ARRIVED:
             result = "refused" if last or self._skipped >= _MAX_SKIPS else "skipped"
@@ -491,25 +487,25 @@ class HomingChain:
         if last or result == "refused":
             return False
         self._skipped = self._skipped + 1 if result == "skipped" else 0
-        self._aim(self._target + 1, command.time)
+        self._aim(self.target + 1, command.time)
         return True
 
     def _aim(self, target: int, time: float | None) -> None:
         """Begins the leg to a target."""
-        self._target, self._began = target, time
+        self.target, self._began = target, time
         self.controller = HomingController(
             self._front_end, self._path[target], self._make_estimator
         )
 
     def _step(self, image: ByteArray, time: float) -> Command:
         command = self.controller.step(image, time)
-        return replace(command, target=self._target, final=self._target + 1 == len(self._path))
+        return replace(command, target=self.target, final=self.target + 1 == len(self._path))
 
     def _note(self, result: LegResult, time: float, remaining: float, reason: str) -> None:
         began = time if self._began is None else self._began
         self.outcomes.append(
             LegOutcome(
-                self._target, result, began, time, self.controller.initialisations, remaining,
+                self.target, result, began, time, self.controller.initialisations, remaining,
                 reason,
             )
         )  # fmt: skip

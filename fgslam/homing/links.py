@@ -73,10 +73,12 @@ def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
     theta_ba = theta_ab + pi - psi_ab. Where one direction cannot decide between two solutions, the
     other may, with more inliers.
     """
-    if isinstance(there, Refusal) and isinstance(back, Refusal):
-        return _same_place(pair, there, back)
-    if isinstance(there, Refusal) or isinstance(back, Refusal):
-        return _one_way(pair, there, back)
+    if isinstance(there, Refusal):
+        if isinstance(back, Refusal):
+            return _same_place(pair, there, back)
+        return _one_way(pair, back, there, way_back=True)
+    if isinstance(back, Refusal):
+        return _one_way(pair, there, back, way_back=False)
     support = min(there.support, back.support)
     if support < MIN_SUPPORT:
         return f"{support} inliers, of {MIN_SUPPORT} needed"
@@ -96,16 +98,13 @@ def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
     )  # fmt: skip
 
 
-def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
+def _one_way(pair: Pair, answer: TwoViewVector, other: Refusal, way_back: bool) -> Link | str:
     """Link of a pair that is answered in one direction and undecided in the other.
 
     Which of the two solutions the few decisive features support, or which minimum of a
     valley, may depend on the draw; that is no contradiction. Any other refusal is, as both answers
     come from the same views.
     """
-    answer, other = (back, there) if isinstance(there, Refusal) else (there, back)
-    if isinstance(answer, Refusal) or not isinstance(other, Refusal):
-        raise TypeError("one direction must be answered, the other refused")
     if other.reason not in _UNDECIDED:
         return f"refused in one direction: {other.details}"
     if answer.support < ONE_WAY_SUPPORT:
@@ -113,7 +112,7 @@ def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
             f"{answer.support} inliers one way, of {ONE_WAY_SUPPORT} needed; back: {other.details}"
         )
     opposite = _opposite(answer)
-    ahead, behind = (opposite, answer) if answer is back else (answer, opposite)
+    ahead, behind = (opposite, answer) if way_back else (answer, opposite)
     return Link(
         *pair, ahead.direction, ahead.rotation, behind.direction, ahead.covariance,
         behind.covariance, answer.support,

@@ -58,19 +58,17 @@ class PlanarPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """Where a robot is when, on a path or without one.
+    """Where a robot is when.
 
     Attributes:
         timestamps: (n,) seconds of the frames, from 0.
         planar: (k, 3) x, y, heading at times (k,); outside the drive the robot stands still.
         driven: (n - 1,) whether the robot drove from a frame to the next, or was carried.
-        path: the curve; None where there is none.
     """
 
     timestamps: FloatArray
     planar: Callable[[FloatArray], FloatArray]
     driven: BoolArray
-    path: PlanarPath | None = None
 
     def body_poses(self, seconds: FloatArray) -> FloatArray:
         """(k, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
@@ -271,7 +269,7 @@ def drive_along(path: PlanarPath, limits: DriveLimits, frames: int | None) -> Dr
             out[arc >= path.length] = [*path.xy[0], path.heading[0]]
         return out
 
-    return Drive(np.arange(frames) / rate, planar, np.ones(frames - 1, np.bool_), path)
+    return Drive(np.arange(frames) / rate, planar, np.ones(frames - 1, np.bool_))
 
 
 # --------------------------------------------------------------------------------------------

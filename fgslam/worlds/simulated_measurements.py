@@ -508,18 +508,10 @@ class IdentityBook:
         self._point_of_id: list[IntArray] = []
         self._count = 0
 
-    def __len__(self) -> int:
-        """Identities given so far."""
-        return self._count
-
     @property
     def point_of_id(self) -> IntArray:
         """(n,) point behind each identity ever given."""
         return np.concatenate([np.empty(0, np.int64), *self._point_of_id])
-
-    def known(self) -> BoolArray:
-        """Which points have an identity now."""
-        return np.asarray(self._id >= 0)
 
     def take(self, seen: BoolArray, expected: BoolArray) -> Sightings:
         """One frame.

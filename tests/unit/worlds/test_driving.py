@@ -18,6 +18,7 @@ from fgslam.worlds.driving import (
     round_corners,
     simulate_wheels,
 )
+from fgslam.worlds.lab import place_path
 from fgslam.worlds.settings import (
     LabDriveSettings,
     WheelOdometrySettings,
@@ -52,8 +53,7 @@ def test_limits_hold_at_every_instant(settings: LabDriveSettings) -> None:
 
 @pytest.mark.parametrize("settings", DRIVES, ids=names)
 def test_acceleration_limit(settings: LabDriveSettings) -> None:
-    path = plan_drive(settings).path
-    assert path is not None
+    path = place_path("lab", settings)
     speed_limit, turn_limit = settings.max_speed_m_s, np.deg2rad(settings.max_turn_deg_s)
     seconds = fastest_times(path, speed_limit, turn_limit, MAX_ACCELERATION_M_S2)
     speed = np.diff(path.arc) / np.diff(seconds)
@@ -99,10 +99,9 @@ def test_closed_paths_end_where_they_began(settings: LabDriveSettings) -> None:
 
 
 def test_waypoints_are_passed() -> None:
-    drive = plan_drive(LabDriveSettings(path="waypoints", waypoints_m=SQUARE, frames=None))
-    assert drive.path is not None
+    path = place_path("lab", LabDriveSettings(path="waypoints", waypoints_m=SQUARE, frames=None))
     for point in SQUARE:
-        assert np.linalg.norm(drive.path.xy - point, axis=1).min() < 5e-3
+        assert np.linalg.norm(path.xy - point, axis=1).min() < 5e-3
 
 
 def test_too_few_frames_are_refused_with_the_least_number() -> None:

@@ -62,8 +62,7 @@ def body(settings: LabDriveSettings, place: PlaceChoice = LAB) -> np.ndarray:
 
 def test_tour_is_closed_and_clear_of_everything(office_space: FloorSpace) -> None:
     drive = planned(ROOMS, "tour", 4)
-    assert drive.path is not None
-    assert drive.path.closed
+    assert place_path("rooms", LabDriveSettings(path="tour", laps=4)).closed
     body = drive.body_poses(drive.timestamps)
     np.testing.assert_allclose(body[-1], body[0], atol=1e-9)
     for poses in (body, body @ RIG.bTc):

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from simulated import plan_drive
 
 from fgslam.worlds import places
-from fgslam.worlds.lab import PlaceChoice, build_place, make_rig
+from fgslam.worlds.lab import PlaceChoice, build_place, make_rig, place_path
 from fgslam.worlds.patches import RayCaster, Thing, stack
 from fgslam.worlds.places import HOUSE, FloorPlan, Place, build_corridors, build_house, build_lab
 from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
@@ -161,9 +160,8 @@ def test_things_stand_on_something(visit: int) -> None:
 @pytest.mark.parametrize("visit", VISITS)
 @pytest.mark.parametrize("path", ["paper_loop", "laps"])
 def test_paths_are_clear_for_a_robot_of_half_a_metre(visit: int, path: str) -> None:
-    drive = plan_drive(LabDriveSettings(path=path, frames=None))  # type: ignore[arg-type]
-    assert drive.path is not None
-    xy = drive.path.xy[::50]
+    drive = LabDriveSettings(path=path, frames=None)  # type: ignore[arg-type]
+    xy = place_path("lab", drive).xy[::50]
     solid = [t for t in lab(visit) if t.name not in ("floor", "ceiling")]
     caster = RayCaster(stack(solid))
     for height in (0.2, 0.6, 1.0):
