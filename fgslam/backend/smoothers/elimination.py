@@ -455,7 +455,12 @@ class Equations:
 
 
 class UndeterminedLandmarkError(UndeterminedError):
-    """A landmark's observations do not determine it; ``row`` among the landmarks."""
+    """Observations do not determine landmarks: rows (k,) among them."""
+
+    def __init__(self, rows: IntArray) -> None:
+        """Rows of the landmarks."""
+        super().__init__(int(rows[0]), "a landmark's observations do not determine it")
+        self.rows = rows
 
 
 class Eliminated:
@@ -556,8 +561,7 @@ def _roots(own: FloatArray) -> FloatArray:
         out[5] = np.sqrt(own[:, 2, 2] - out[3] ** 2 - out[4] ** 2)
     bad = ~np.isfinite(out).all(axis=0) | ~(out[[0, 2, 5]] > 0.0).all(axis=0)
     if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise UndeterminedLandmarkError(row, "a landmark's observations do not determine it")
+        raise UndeterminedLandmarkError(np.flatnonzero(bad))
     return out
 
 

@@ -571,7 +571,8 @@ _SHORT = 0.01
 within it."""
 _NONE = np.empty(0, np.int64)
 _STEPS = 3  # with a frame: what is left after them is gone with the next frame
-_REPAIRS = 20  # landmarks taken out in one solution before the graph itself must be wrong
+_REPAIRS = 20  # times that landmarks are taken out before the graph itself must be wrong
+_LEAST_SHARE = 0.1  # of a step
 _LEFT_BETWEEN = 5  # poses that leave until their hidden numbers are looked through again
 
 
@@ -651,15 +652,26 @@ class Window:
     def solve(self) -> Solved:
         """Gauss-Newton steps until one is short, and the equations that the last was taken by.
 
+        Of a step after which cameras have landmarks behind them, a half or less is taken.
+
         Raises:
             UndeterminedLandmarkError: a landmark is not determined by its observations.
             UndeterminedError: a pose is not.
         """
+        solution = Eliminated(self.equations())
         for _ in range(_STEPS):
-            eliminated = Eliminated(self.equations())
+            eliminated, share = solution, 1.0
             self._move(eliminated)
             if np.abs(eliminated.corner[eliminated.hidden :]).max() < _SHORT:
                 break
+            while solution is eliminated:
+                try:
+                    solution = Eliminated(self.equations())
+                except UndeterminedLandmarkError:
+                    if share < _LEAST_SHARE:
+                        raise
+                    share *= 0.5
+                    self._move(eliminated, -share)
         return Solved(eliminated, list(self.frames), self.landmarks.variables)
 
     def repaired(
@@ -675,7 +687,8 @@ class Window:
             try:
                 return self.solve()
             except UndeterminedLandmarkError as error:
-                take_out(int(self.landmarks.variables[error.row]))
+                for variable in self.landmarks.variables[error.rows].tolist():
+                    take_out(variable)
             except (UndeterminedError, np.linalg.LinAlgError) as error:
                 raise failed(error) from None
         raise failed(EstimatorError("too many landmarks left it indeterminate"))
@@ -688,15 +701,15 @@ class Window:
             dict(zip(map(landmark_key, known.variables.tolist()), known.points, strict=True)),
         )
 
-    def _move(self, step: Eliminated) -> None:
-        by = step.corner[step.hidden :].reshape(-1, 6)
+    def _move(self, step: Eliminated, share: float = 1.0) -> None:
+        by = share * step.corner[step.hidden :].reshape(-1, 6)
         self._shift = self._shift + np.where(self._fixed()[:, None], by, 0.0)
         poses = [
             self._anchors[frame] @ se3_exp(shift) if frame in self._anchors else wTc @ se3_exp(own)
             for frame, wTc, shift, own in zip(self.frames, self.poses, self._shift, by, strict=True)
         ]
         self.poses = np.array(poses)
-        points = self.landmarks.points + step.points
+        points = self.landmarks.points + share * step.points
         self.landmarks = dataclasses.replace(self.landmarks, points=points)
 
     def _fixed(self) -> BoolArray:

@@ -67,8 +67,7 @@ def spoil(estimator: Any, error: Any) -> None:
 
 def undetermined(variable: int) -> Callable[[Window], UndeterminedLandmarkError]:
     def error(window: Window) -> UndeterminedLandmarkError:
-        row = int(np.searchsorted(window.landmarks.variables, variable))
-        return UndeterminedLandmarkError(row, "its observations do not determine it")
+        return UndeterminedLandmarkError(np.flatnonzero(window.landmarks.variables == variable))
 
     return error
 
