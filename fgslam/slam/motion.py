@@ -171,7 +171,7 @@ class OdometryMotion:
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """The stand-in goes on from there."""
         self._stand_in.displaced(timestamp, wTc, carried)
-        self.gyroscope.displaced()
+        self.gyroscope.displaced(None if carried else wTc)
 
     def regained(self, timestamp: float, wTc: FloatArray) -> None:
         """The stand-in goes on from there."""
@@ -263,7 +263,7 @@ class MotionModel(Protocol):
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """Learns a pose that does not go on from the one before: between them lies no motion.
 
-        A closed loop has corrected it; or the camera was ``carried`` and has been found again.
+        The estimator has corrected it, or the camera was ``carried`` and has been found again.
         """
         ...
 
@@ -414,6 +414,8 @@ class GyroscopeError:
             missing = _STATED_WEIGHT - self._expected
             self._found, self._expected = self._found + missing, _STATED_WEIGHT
 
-    def displaced(self) -> None:
-        """Between the last pose and the next lies no motion."""
-        self._step = self._before = None
+    def displaced(self, wTc: FloatArray | None = None) -> None:
+        """Goes on from a pose as well known as the last one; from none where that is not known."""
+        before, self._step, self._before = self._before, None, None
+        if before is not None and wTc is not None:
+            self._before = Prediction(wTc, before.covariance)

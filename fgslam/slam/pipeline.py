@@ -448,14 +448,23 @@ Snapshot: TypeAlias = list[tuple[Any, Any]]
 def observe(
     motion: MotionModel, increment: Increment, tracking: EgoMotion, stats: UpdateStats
 ) -> None:
-    """Hands the pose to the motion model; a jump by loop or against the odometry is no motion."""
-    if increment.relocalised and not any(stats.closed) and not _known(increment.odometry):
-        motion.regained(increment.timestamp, stats.wTc)
-    elif any(stats.closed) or increment.relocalised:
-        motion.displaced(increment.timestamp, stats.wTc, increment.relocalised)
+    """Hands the pose to the motion model; a jump by loop or against the odometry is no motion.
+
+    Nor is what the estimator corrects the pose by, after it was tracked on the map as it was: the
+    pose before moves alike.
+    """
+    time, wTc = increment.timestamp, tracking.wTc
+    regained = increment.relocalised and not _known(increment.odometry)
+    if any(stats.closed) or (increment.relocalised and not regained):
+        motion.displaced(time, stats.wTc, increment.relocalised)
+        return
+    measured = regained or _anchored(increment, tracking, stats)
+    if regained:
+        motion.regained(time, wTc)
     else:
-        pose = Prediction(stats.wTc, tracking.covariance)
-        motion.observe(increment.timestamp, pose, _anchored(increment, tracking, stats))
+        motion.observe(time, Prediction(wTc, tracking.covariance), measured)
+    if measured and (stats.wTc != wTc).any():
+        motion.displaced(time, stats.wTc, carried=False)
 
 
 def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:

@@ -11,15 +11,17 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Increment, Odometry
 from fgslam.core.store import restore, state_of
-from fgslam.core.types import Prediction
+from fgslam.core.types import EgoMotionStatus, Prediction, UpdateStats
+from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.slam.motion import (
     START_ACCELERATION_SIGMA,
     START_VELOCITY_SIGMA,
     ConstantVelocityMotion,
     OdometryMotion,
 )
+from fgslam.slam.pipeline import observe
 
 TWIST = np.array([0.05, -0.3, 0.1, 0.4, -0.1, 1.2])  # rad/s and m/s in the camera's frame
 
@@ -223,6 +225,21 @@ def test_an_unmeasured_start_teaches_no_standstill() -> None:
     step = motion.between(0.2)
     assert step is not None
     assert step.covariance[3, 3] == pytest.approx((0.1 * START_VELOCITY_SIGMA[3]) ** 2)
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_what_the_estimator_corrects_is_no_motion(found: bool) -> None:
+    """A pose is tracked on the map as it was; map and pose are then moved together."""
+    motion, step, last = ConstantVelocityMotion(), g.se3_exp(0.5 * TWIST), np.eye(4)
+    by = g.se3_exp(np.array([0.1, 0.0, 0.2, 1.0, -2.0, 0.5]))
+    for k in range(4):
+        tracked = unmeasured(at(last @ step), EgoMotionStatus.OK)
+        seen = dataclasses.replace(Increment.of(k, 0.5 * k, None), relocalised=found)
+        last = by @ tracked.wTc
+        observe(motion, seen, tracked, UpdateStats(last, np.eye(6), 9, 0.0, 0))
+    expected = motion.between(2.0)
+    assert expected is not None
+    np.testing.assert_allclose(expected.motion, step, atol=1e-12)
 
 
 @pytest.mark.parametrize("carried", [False, True])
