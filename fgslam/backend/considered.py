@@ -451,7 +451,7 @@ class TrackedStep:
         increment: its measurements.
         tracking: its pose.
         before: the last frame's pose; of the first one the prior pose, exactly.
-        prediction: from there.
+        prediction: from there; worth nothing where the least squares searched everywhere.
     """
 
     frame: int
@@ -466,21 +466,14 @@ class TrackedStep:
         status = self.tracking.status
         return status.measured and status is not EgoMotionStatus.CAPPED
 
-    @property
-    def expected(self) -> Prediction:
-        """What the least squares had besides the matches; nothing where it searched everywhere."""
-        free = self.increment.relocalised
-        return Prediction(self.prediction.wTc, FREE) if free else self.prediction
-
     def added(self) -> tuple[FloatArray, FloatArray]:
         """What takes an error of the last pose (6, 6) to this one or its prediction, and the noise.
 
         The latter is the covariance (6, 6) that the step adds.
         """
         carried = adjoint(inverse(inverse(self.before.wTc) @ self.tracking.wTc))
-        if starts_new_part(self.increment, self.tracking):
-            return carried, FREE
-        pose = self.expected if self.measured else self.tracking
+        known = not (self.measured or starts_new_part(self.increment, self.tracking))
+        pose = self.tracking if known else self.prediction
         return carried, pose.covariance - congruence(carried, self.before.covariance)
 
 
@@ -557,7 +550,7 @@ class SampledErrors(ErrorColumns):
         self._pose_columns = self._on_floor(wTc, moved)
         if step.measured:
             by_prediction, by_measurement = self._solver.gain(
-                wTc, step.expected, problem, self._taken
+                wTc, step.prediction, problem, self._taken
             )
             self._pose_columns = by_prediction @ moved + columns.following(
                 by_measurement, self._seen[2]

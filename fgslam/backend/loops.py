@@ -74,17 +74,32 @@ def starts_new_part(increment: Increment, tracking: EgoMotion) -> bool:
     return guessed(increment, tracking) and int(increment.observations.is_new.sum()) >= _PART
 
 
-def unknown_step_covariance(increment: Increment, times: Sequence[float]) -> FloatArray:
-    """(6, 6) of the step to a frame that nothing ties to those before, at ``times`` (n,).
+def with_unknown_step(
+    increment: Increment, tracking: EgoMotion, before: FloatArray, times: Sequence[float]
+) -> Increment:
+    """The increment; its step free to be any other where nothing ties it to the frames before.
 
-    After a gap in time it is the guess's, of the last velocity and its spread: that what was seen
-    before is out of view refutes nothing. Else the camera may have been carried anywhere.
+    It was found without a prior, or starts a part of the map. After a gap in time the guess stays,
+    of the last velocity and its spread: that what was seen before is out of view refutes nothing.
+    A gyroscope has felt even how a camera was carried.
+
+    Args:
+        increment: the frame.
+        tracking: its pose.
+        before: (4, 4) the last pose.
+        times: (n,) of the frames before.
     """
-    guess = increment.odometry
-    if guess is None or increment.relocalised or len(times) < 2:
-        return FREE
-    gap = increment.timestamp - times[-1] > _GAP * float(np.median(np.diff(times)))
-    return guess.covariance if gap else FREE
+    if not (increment.relocalised or starts_new_part(increment, tracking)):
+        return increment
+    guess, late = increment.odometry, len(times) > 1 and not increment.relocalised
+    late = late and increment.timestamp - times[-1] > _GAP * float(np.median(np.diff(times)))
+    covariance = (guess.covariance if late and guess is not None else FREE).copy()
+    step = Odometry(inverse(before) @ tracking.wTc, covariance, measured=False)
+    if guess is not None and guess.turned:
+        step.motion[:3, :3] = guess.motion[:3, :3]
+        covariance[:3, :3] = guess.covariance[:3, :3]
+        step = dataclasses.replace(step, turned=True, bias=guess.bias)
+    return dataclasses.replace(increment, odometry=step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -359,14 +374,15 @@ class DriveRecord:
         Args:
             motion: the frame's pose as tracked, in the last one's.
             tracking: how the frame was tracked.
-            known: what the frame was predicted with.
-            free: the step is not known: the frame was found without a prior.
+            known: what the frame was predicted with; :func:`with_unknown_step` where it is free.
+            free: the frame was found without a prior, or starts a part of the map.
         """
         before, self._coherent = self._coherent, tracking.coherent
-        if free:
-            covariance = FREE
-        elif known is None or (before and self._coherent and tracking.status.measured):
+        measured = before and self._coherent and tracking.status.measured
+        if known is None or (measured and not free):
             covariance = tracking.covariance
+        elif free:
+            covariance = known.covariance
         else:
             motion, covariance = known.motion, known.covariance
         self._chain.append(motion, covariance)

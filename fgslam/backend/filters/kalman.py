@@ -36,6 +36,7 @@ from fgslam.backend.loops import (
     rotated,
     starts_new_part,
     transported,
+    with_unknown_step,
 )
 from fgslam.backend.measured import Waiting, linearised, nuisance_words, require_model
 from fgslam.backend.protocol import recalibrated
@@ -128,7 +129,9 @@ class LandmarkKalman:
         closure, which is its uncertainty relative to the place returned to.
         """
         self._past.require_later(increment)
-        recalibrated(self, increment.rig_correction, increment.rig_since)
+        times, rig = self._past.timestamps, (increment.rig_correction, increment.rig_since)
+        increment = with_unknown_step(increment, tracking, self._current.wTc, times)
+        recalibrated(self, *rig)
         step = self._step(increment, tracking)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)

@@ -26,7 +26,7 @@ from fgslam.backend.loops import (
     CLOSURE_FACTOR,
     Constraint,
     starts_new_part,
-    unknown_step_covariance,
+    with_unknown_step,
 )
 from fgslam.backend.persistence import learn_from
 from fgslam.backend.protocol import recalibrated
@@ -116,10 +116,10 @@ class Smoother:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
-        free = increment.relocalised or starts_new_part(increment, tracking)
-        if free and len(self.inputs):
-            step = self._unknown_step(increment, tracking)
-            increment = dataclasses.replace(increment, odometry=step)
+        before = self.tracker.predict(None).wTc
+        if self.inputs:
+            times = [one.increment.timestamp for one in self.inputs]
+            increment = with_unknown_step(increment, tracking, before, times)
         require_finite(increment, tracking)
         recalibrated(self, increment.rig_correction, increment.rig_since)
         before = self.tracker.predict(None).wTc
@@ -148,23 +148,6 @@ class Smoother:
 
     # -- its steps -----------------------------------------------------------------------------
 
-    def _unknown_step(self, increment: Increment, tracking: EgoMotion) -> Odometry:
-        """The step to a frame found without a prior, or not at all: any, but after a gap in time.
-
-        But a gyroscope has felt even how the camera was carried.
-        """
-        before, turn = self.tracker.predict(None).wTc, increment.odometry
-        times = [one.increment.timestamp for one in self.inputs]
-        motion, covariance = (
-            inverse(before) @ tracking.wTc,
-            unknown_step_covariance(increment, times),
-        )
-        if turn is None or not turn.turned:
-            return Odometry(motion, covariance, measured=False)
-        motion[:3, :3], covariance = turn.motion[:3, :3], covariance.copy()
-        covariance[:3, :3] = turn.covariance[:3, :3]
-        return Odometry(motion, covariance, measured=False, turned=True, bias=turn.bias)
-
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self.inputs.append(Input(increment, tracking))
         self.builder.note(increment)
@@ -181,6 +164,8 @@ class Smoother:
         moved = admission.contradicted(self._held(matched.select(outliers)), tracking.wTc)
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
+        if starts_new_part(increment, tracking):  # what matched agrees on no pose: chance would
+            used[:] = False
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame, step = len(self.inputs) - 1, increment.odometry
         turn, measured = Turn.of((step,)), increment.measured

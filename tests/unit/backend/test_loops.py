@@ -37,7 +37,6 @@ from fgslam.backend.loops import (
     rigid_motions,
     rotated,
     transported,
-    unknown_step_covariance,
 )
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
@@ -62,6 +61,7 @@ from fgslam.core.store import restore, state_of
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Estimate
 from fgslam.evaluation.statistics import pose_nees
 from fgslam.factors.graphs import landmark_key, poses_of_frame
+from fgslam.frontend.tracking.ego_motion import unmeasured
 
 # ------------------------------------------------------------------------------------------
 # Backward correction: the least weighted changes to a chain under which a loop closes
@@ -424,6 +424,36 @@ def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
     np.testing.assert_allclose(solver.poses[0], drive.poses[0], rtol=0, atol=1e-6)
 
 
+def test_a_loop_within_the_window_turns_a_part_that_only_a_guess_joined() -> None:
+    """Ten frames that see nothing known, guessed to be turned by 100 degrees, then a loop."""
+    drive = simulate(Drive(frames=20, points=120), np.random.default_rng(2))
+    turned = g.pose(g.so3_exp(np.array([0.0, np.deg2rad(170.0), 0.0])), np.zeros(3))
+    increments, seen, none = [], set[int](), np.empty(0, np.int64)
+    for k, each in enumerate(drive.increments):
+        observed, step = each.observations, each.odometry
+        if k >= 10:
+            new = np.array([i not in seen for i in observed.ids])
+            seen |= set(observed.ids.tolist())
+            observed = replace(observed, ids=observed.ids + 1000, is_new=new)
+        if k == 10:
+            assert step is not None
+            step = Odometry(step.motion @ turned, 1e-4 * np.eye(6), measured=False)
+        plain = replace(each, missed_ids=none, pruned_ids=none, observations=observed)
+        rejected = np.zeros(len(observed), np.bool_)
+        increments.append(replace(plain, odometry=step, rejected=rejected))
+    back = g.inverse(drive.poses[5]) @ drive.poses[19]
+    loop = LoopClosure(5, back, 1e-6 * np.eye(6), NO_IDS, np.empty((0, 2), np.int64))
+    increments[-1] = replace(increments[-1], loops=(loop,))
+    estimator = build(SlidingWindowSettings())
+    stats = play_directly(estimator, increments, FREE)
+    assert stats[-1].closed == (True,)
+    off = np.linalg.norm(stats[-2].wTc[:3, 3] - drive.poses[18, :3, 3])
+    assert off > 0.5, "before it is closed"
+    assert np.linalg.norm(stats[-1].wTc[:3, 3] - drive.poses[19, :3, 3]) < 0.03
+    found = estimator.estimate().trajectory.poses
+    assert np.linalg.norm(found[:, :3, 3] - drive.poses[:, :3, 3], axis=1).max() < 0.05
+
+
 def test_a_loop_within_a_lag_so_long_that_it_drifts_is_closed_and_a_wrong_one_refused() -> None:
     """The drift in between explains the one and not the other; nothing moves as one piece."""
     off, remarks = [], []
@@ -620,13 +650,25 @@ def test_relocalised_robot_is_where_its_landmarks_are(name: str) -> None:
     assert np.linalg.norm(final, axis=1).max() < 0.05
 
 
-def test_only_a_gap_in_time_leaves_the_guess_what_it_is() -> None:
-    """Half a second without frames at ten a second; a frame in time was carried anywhere."""
-    times = [0.0, 0.1, 0.2, 0.3]
-    guess = Odometry(np.eye(4), 0.04 * np.eye(6), measured=False)
-    for late, expected in ((0.4, UNMEASURED), (0.9, guess.covariance)):
-        increment = Increment.of(4, late, guess)
-        np.testing.assert_array_equal(unknown_step_covariance(increment, times), expected)
-        found = replace(increment, relocalised=True)
-        np.testing.assert_array_equal(unknown_step_covariance(found, times), UNMEASURED)
-    np.testing.assert_array_equal(unknown_step_covariance(increment, times[:1]), UNMEASURED)
+@pytest.mark.parametrize("settings", [LandmarkKalmanSettings(), SlidingWindowSettings()])
+@pytest.mark.parametrize(("late", "found", "sigma_m"), [
+    (0.5, False, 30.0), (5.0, False, 0.2), (5.0, True, 30.0)
+])  # fmt: skip
+def test_only_a_gap_in_time_leaves_the_guess_what_it_is(
+    settings: EstimatorSettings, late: float, found: bool, sigma_m: float
+) -> None:
+    """Five seconds without frames at two a second; a frame in time was carried anywhere."""
+    increments = simulate(Drive(frames=8, points=60), np.random.default_rng(2)).increments
+    estimator = build(settings)
+    play(estimator, increments, FREE)
+    last, guess = increments[-1], Odometry(np.eye(4), 0.04 * np.eye(6), measured=False)
+    seen = last.observations
+    new = replace(seen, ids=seen.ids + 1000, is_new=np.ones(len(seen), np.bool_))
+    after = replace(
+        Increment.of(20, last.timestamp + late, guess),
+        observations=new, rejected=~new.is_new, relocalised=found,
+    )  # fmt: skip
+    tracking = unmeasured(estimator.predict(guess), EgoMotionStatus.TOO_FEW_MATCHES)
+    estimator.update(after, tracking)
+    covariance = estimator.estimate().covariances[-1]
+    np.testing.assert_allclose(np.sqrt(covariance[5, 5]), sigma_m, rtol=0.3, atol=0)
