@@ -11,6 +11,7 @@ from benchmarks.speed import (
     estimators,
     homing,
     images,
+    live,
     long_drive,
     maps,
     relocalising,
@@ -24,6 +25,7 @@ from fgslam.core.threads import one_blas_thread
 
 LIMITS: dict[str, float] = (
     images.LIMITS
+    | live.LIMITS
     | estimators.LIMITS
     | long_drive.LIMITS
     | homing.LIMITS
@@ -51,6 +53,7 @@ def over_maps() -> dict[str, float]:
 
 PARTS: dict[str, Callable[[int], dict[str, float]]] = {
     "images": images.over_images,
+    "live": live.over_live,
     "estimators": lambda frames: over_measurements(),
     "maps": lambda frames: over_maps(),
     "homing": lambda frames: homing.ratios_of_homing(),

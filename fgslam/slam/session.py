@@ -26,6 +26,7 @@ from fgslam.core.errors import (
 )
 from fgslam.core.geometry import is_rigid
 from fgslam.core.log import Frame, MeasurementLog
+from fgslam.core.memory import keep_freed_memory
 from fgslam.core.sensors import CameraRig, Measured, Odometry, compose_odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import LandmarkMap, Remark, Trajectory
@@ -124,6 +125,7 @@ class Session:
                 the seed is negative, or a setting of the front-end is not known or not usable.
             MapError: other cameras made the map, or it is empty.
         """
+        keep_freed_memory()
         require_rig(rig)
         require_seed(seed, "session")
         frontend = chosen_frontend(frontend)
