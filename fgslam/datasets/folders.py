@@ -67,20 +67,29 @@ def open_image_folder(
     root = Path(settings.path)
     require_folder(root, "the recording")
     cameras = _numbered_images(root)
-    calibration = root / "calib.json"
-    if settings.camera_file is not None:
-        calibration = Path(settings.camera_file)
-    rig = _folder_rig(root, settings, calibration, cameras)
+    own, three = settings.camera_file is None, len(cameras) == 3
+    calibration = Path(settings.camera_file or root / "calib.json")
+    chosen = ((0, 1, 2) if three else (0, 1)) if own else None
+    size = first_size(cameras[root / "right"].values())
+    rig = loaded_rig(settings, calibration, size=size, cameras=chosen, pair=not three)
+    # Two of three cameras in a line may be the outer ones, where the file states the images' sides.
+    known = None if rig.rectifier is None else rig.rectifier.calibration
+    outer_two = known is not None and known.sided and len(known.cameras) == 3
+    if three and rig.vertical_baseline is None and not outer_two:
+        raise CalibrationError(
+            f"{calibration} knows two cameras, but {root} has a third one, top/; give a "
+            "calibration of all three, or move top/ elsewhere"
+        )
+    rig = mounted(rig if three else replace(rig, vertical_baseline=None), settings)
     numbers, stamps = _read_times(root / "times.txt")
     files, listed, ledger = numbered_frames(cameras, numbers.tolist(), root / "times.txt")
     images, noticed = open_frames(files, rig, root)
-    known = set(numbers.tolist())
-    unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
+    stated = set(numbers.tolist())
+    unlisted = {folder.name: len(found.keys() - stated) for folder, found in cameras.items()}
     notes = [
         f"{n} images of {k}/ are not in times.txt and unused" for k, n in unlisted.items() if n
     ]
-    without_top = settings.camera_file is None and len(cameras) == 2
-    if without_top and "vertical_baseline_m" in read_json_object(calibration):
+    if own and not three and "vertical_baseline_m" in read_json_object(calibration):
         notes.append(
             "calib.json states a vertical baseline but there is no top/: read as two cameras"
         )
@@ -139,28 +148,6 @@ def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:
                 f"{folder} holds no image named by its number (000000.png ...); restore them"
             )
     return cameras
-
-
-def _folder_rig(
-    root: Path,
-    settings: ImageFolderSettings,
-    calibration: Path,
-    cameras: dict[Path, dict[int, Path]],
-) -> StereoRig:
-    """The rectified rig, with what rectifies the images where they are raw."""
-    three = len(cameras) == 3
-    chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
-    size = first_size(cameras[root / "right"].values())
-    rig = loaded_rig(settings, calibration, size=size, cameras=chosen, pair=not three)
-    # Two of three cameras in a line may be the outer ones, where the file states the images' sides.
-    known = None if rig.rectifier is None else rig.rectifier.calibration
-    outer_two = known is not None and known.sided and len(known.cameras) == 3
-    if three and rig.vertical_baseline is None and not outer_two:
-        raise CalibrationError(
-            f"{calibration} knows two cameras, but {root} has a third one, top/; give a "
-            "calibration of all three, or move top/ elsewhere"
-        )
-    return mounted(rig if three else replace(rig, vertical_baseline=None), settings)
 
 
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:

@@ -134,7 +134,21 @@ def teach(
     front_end = replace(DRIVING, features=_require_features(features, "teach"))
     given = (colour_image(image, size, f"image {k}") for k, image in enumerate(images))
     if select:
-        return _selected(given, camera, front_end, names)
+        teacher = Teacher(camera, front_end)
+        passed_over: tuple[int, str, Image] | None = None
+        k = -1
+        for k, image in enumerate(given):
+            if names is not None and k >= len(names):
+                raise StoredMapError(f"path: {len(names)} names for more images; give one an image")
+            passed_over = (k, str(k) if names is None else names[k], image)
+            if k >= teacher.next:
+                teacher.take(*passed_over)
+                passed_over = None
+        if names is not None and len(names) != k + 1:
+            raise StoredMapError(f"path: {len(names)} names for {k + 1} images; give one an image")
+        if passed_over is not None:  # the last one is the path's end
+            teacher.take(*passed_over)
+        return teacher.finish().memory
     extractor = OmniFeatureExtractor(camera, front_end.features)
     found = [_recognisable(image, k, extractor) for k, image in enumerate(given)]
     if not found:
@@ -151,29 +165,6 @@ def _recognisable(image: Image, number: int, extractor: OmniFeatureExtractor) ->
             f"path: image {number} cannot be recognised ({refusal.details}); leave it out"
         )
     return features
-
-
-def _selected(
-    images: Iterable[Image],
-    camera: OmniCamera,
-    front_end: FrontEndSettings,
-    names: Sequence[str] | None,
-) -> PathMemory:
-    teacher = Teacher(camera, front_end)
-    passed_over: tuple[int, str, Image] | None = None
-    k = -1
-    for k, image in enumerate(images):
-        if names is not None and k >= len(names):
-            raise StoredMapError(f"path: {len(names)} names for more images; give one an image")
-        passed_over = (k, str(k) if names is None else names[k], image)
-        if k >= teacher.next:
-            teacher.take(*passed_over)
-            passed_over = None
-    if names is not None and len(names) != k + 1:
-        raise StoredMapError(f"path: {len(names)} names for {k + 1} images; give one an image")
-    if passed_over is not None:  # the last one is the path's end
-        teacher.take(*passed_over)
-    return teacher.finish().memory
 
 
 _SEEKING = (HomingState.INITIALISE, HomingState.WAIT, HomingState.SEARCH, HomingState.REFUSED)

@@ -67,7 +67,27 @@ class ImageFrontEnd:
         if isinstance(answer, Refusal):
             return answer
         present, matches, vector = answer
-        return self._started(image, time, vector, matches, (present, target))
+        # Trackable points of the inliers, triangulated; those in front are tracked from now on.
+        stabilised = self._tracker.stabilised
+        _, pixels, points = move_to_trackable(
+            stabilised.grey(image),
+            stabilised.view,
+            matches.select(vector.inliers),
+            (present, target),
+        )
+        known = np.flatnonzero(triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA))
+        known = known[surest_all_around(points.select(known), _MAX_POINTS)]
+        points, pixels = points.select(known), pixels[known]
+        least = self._settings.homing_vector.min_inliers
+        if len(points) < least:
+            return Refusal(
+                RefusalReason.TOO_FEW_INLIERS,
+                f"{len(points)} of {vector.support} inliers can be tracked, of {least} needed",
+            )
+        vector = replace(vector, inliers=np.ones(len(points), dtype=np.bool_))
+        local_map = make_local_map(vector, points)
+        self._tracker.start(image, time, local_map.ids, pixels)
+        return HomingStart(time, vector, local_map, points)
 
     def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """The homing vector and its inliers; leaves all tracks alone."""
@@ -105,36 +125,6 @@ class ImageFrontEnd:
             return refusal
         vector, matches = compare_views(present, target, self._settings, self._rng)
         return vector if isinstance(vector, Refusal) else (present, matches, vector)
-
-    def _started(
-        self,
-        image: ByteArray,
-        time: float,
-        vector: TwoViewVector,
-        matches: BearingMatches,
-        features: tuple[OmniFeatures, OmniFeatures],
-    ) -> HomingStart | Refusal:
-        """Trackable points of the inliers, triangulated; those in front are tracked from now on."""
-        stabilised = self._tracker.stabilised
-        _, pixels, points = move_to_trackable(
-            stabilised.grey(image),
-            stabilised.view,
-            matches.select(vector.inliers),
-            features,
-        )
-        known = np.flatnonzero(triangulable(make_local_map(vector, points), _MAX_RELATIVE_SIGMA))
-        known = known[surest_all_around(points.select(known), _MAX_POINTS)]
-        points, pixels = points.select(known), pixels[known]
-        least = self._settings.homing_vector.min_inliers
-        if len(points) < least:
-            return Refusal(
-                RefusalReason.TOO_FEW_INLIERS,
-                f"{len(points)} of {vector.support} inliers can be tracked, of {least} needed",
-            )
-        vector = replace(vector, inliers=np.ones(len(points), dtype=np.bool_))
-        local_map = make_local_map(vector, points)
-        self._tracker.start(image, time, local_map.ids, pixels)
-        return HomingStart(time, vector, local_map, points)
 
 
 def compare_views(

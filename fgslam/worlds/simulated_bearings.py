@@ -103,10 +103,25 @@ def simulate_homing(
     n = settings.features + wrong
     points, decoys = np.split(_points(target, 2 * n, rng), 2)
     heights = rng.uniform(_LOWEST_M, _HIGHEST_M, n) * rng.choice([-1.0, 1.0], n)
-    matches = _matches(target, points, heights, wrong, rng)
+    end = np.arange(n)
+    swapped = np.sort(rng.permutation(n)[:wrong])
+    end[swapped] = np.roll(swapped, 1) if wrong > 1 else (swapped + 1) % n
+    seen_a = _measured(np.zeros(3), points, heights, rng)
+    seen_b = _measured(target, points, heights, rng)[:, end]
+    matches = BearingMatches(
+        kind=np.full(n, int(FeatureKind.SIFT)),
+        index_a=np.arange(n),
+        index_b=end,
+        bearing_a=seen_a[0],
+        elevation_a=seen_a[1],
+        bearing_b=seen_b[0],
+        elevation_b=seen_b[1],
+        sigma=np.full((n, 4), _SIGMA),
+        quality=rng.random(n),
+    )
     robots = _drive(settings, target, rng)
     tracks = _tracks(settings, outliers, np.stack([points, decoys]), heights, robots, rng)
-    correct = matches.index_b == np.arange(n)
+    correct = end == np.arange(n)
     landmarks = np.where(correct[:, None], points, np.nan)
     return SimulatedHoming(0.0, matches, correct, tracks, HomingTruth(target, robots, landmarks))
 
@@ -120,32 +135,6 @@ def _points(target: FloatArray, count: int, rng: np.random.Generator) -> FloatAr
     along = np.clip(points @ target[:2] / (target[:2] @ target[:2]), 0.0, 1.0)
     from_way = np.linalg.norm(points - along[:, None] * target[:2], axis=1)
     return np.asarray(points[from_way >= _NEAREST_M][:count])
-
-
-def _matches(
-    target: FloatArray,
-    points: FloatArray,
-    heights: FloatArray,
-    wrong: int,
-    rng: np.random.Generator,
-) -> BearingMatches:
-    n = len(points)
-    end = np.arange(n)
-    swapped = np.sort(rng.permutation(n)[:wrong])
-    end[swapped] = np.roll(swapped, 1) if wrong > 1 else (swapped + 1) % n
-    seen_a = _measured(np.zeros(3), points, heights, rng)
-    seen_b = _measured(target, points, heights, rng)[:, end]
-    return BearingMatches(
-        kind=np.full(n, int(FeatureKind.SIFT)),
-        index_a=np.arange(n),
-        index_b=end,
-        bearing_a=seen_a[0],
-        elevation_a=seen_a[1],
-        bearing_b=seen_b[0],
-        elevation_b=seen_b[1],
-        sigma=np.full((n, 4), _SIGMA),
-        quality=rng.random(n),
-    )
 
 
 def _measured(
