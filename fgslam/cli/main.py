@@ -731,15 +731,6 @@ def _keep_close_options(error: Exception) -> None:
         error.possibilities = [names[name] for name in close]  # type: ignore[attr-defined]
 
 
-def _performed(arguments: list[str]) -> int:
-    """Exit status of a command. Raises what it raised, an interruption as KeyboardInterrupt."""
-    with ShortageTold():
-        status = int(app(arguments, prog_name="fgslam", standalone_mode=False) or 0)
-    if status == _OF_TYPER and signals.was_asked():
-        raise KeyboardInterrupt
-    return status
-
-
 def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
     # None is used, and the search through all installed packages is a tenth of reading settings.
@@ -751,7 +742,11 @@ def main() -> None:
     arguments = sys.argv[1:] or ["--help"]
     signals.forget()
     try:
-        raise SystemExit(_performed(arguments))
+        with ShortageTold():
+            status = int(app(arguments, prog_name="fgslam", standalone_mode=False) or 0)
+        if status == _OF_TYPER and signals.was_asked():
+            raise KeyboardInterrupt
+        raise SystemExit(status)
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "fgslam"
         _keep_close_options(error)

@@ -87,8 +87,12 @@ def _row(
     exact = _home(robot, target)
     error = np.array([home.distance, home.direction, home.rotation]) - exact
     error[1:] = wrap(error[1:])
-    polar, spread = _polar_target(estimate)
-    state = np.concatenate([estimate.robot - robot, polar - _home(np.zeros(3), target)])
+    # The target as (distance, direction, rotation) from the start, jointly with the robot.
+    start, change = np.zeros(3), np.eye(6)
+    change[3:, 3:] = home_vector_jacobian(start, estimate.target)[:, 3:]
+    spread = change @ estimate.covariance @ change.T
+    off = _home(start, estimate.target) - _home(start, target)
+    state = np.concatenate([estimate.robot - robot, off])
     state[[2, 4, 5]] = wrap(state[[2, 4, 5]])
     if spread[3, 3] < _HELD**2:
         state[3] = 0.0
@@ -100,14 +104,6 @@ def _home(robot: FloatArray, target: FloatArray) -> FloatArray:
     offset = target[:2] - robot[:2]
     direction = np.arctan2(offset[1], offset[0]) - robot[2]
     return np.array([np.hypot(*offset), direction, target[2] - robot[2]])
-
-
-def _polar_target(estimate: HomingEstimate) -> tuple[FloatArray, FloatArray]:
-    """Target (distance, direction, rotation) from the start; joint covariance with the robot."""
-    start = np.zeros(3)
-    change = np.eye(6)
-    change[3:, 3:] = home_vector_jacobian(start, estimate.target)[:, 3:]
-    return _home(start, estimate.target), change @ estimate.covariance @ change.T
 
 
 # --------------------------------------------------------------------------------------------

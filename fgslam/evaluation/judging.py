@@ -28,7 +28,6 @@ from fgslam.evaluation.statistics import (
     estimate_from_truth,
     evaluate_trajectory,
     judge,
-    landmark_nees,
     nees as normalised,
     pose_errors,
     position_errors,
@@ -385,7 +384,7 @@ def landmark_errors(
     true = transform_to_world(eTt, truth.positions[of])
     positions = landmarks.positions[rows]
     distances = np.linalg.norm(positions - true, axis=1)
-    return distances, landmark_nees(positions, landmarks.covariances[rows], true)
+    return distances, normalised(true - positions, landmarks.covariances[rows])
 
 
 Comparable: TypeAlias = Outcome | Answer | Estimate
@@ -589,7 +588,7 @@ def mean_interval(values: FloatArray, probability: float = 0.95) -> MeanInterval
     return MeanInterval(mean, mean - half, mean + half, n, probability)
 
 
-def paired_test(a: FloatArray, b: FloatArray, probability: float = 0.95) -> PairedTest | None:
+def paired_test(a: FloatArray, b: FloatArray) -> PairedTest | None:
     """Compares values (n,) of A and B on the same trials; pairs with an unknown value are left out.
 
     Returns:
@@ -597,7 +596,7 @@ def paired_test(a: FloatArray, b: FloatArray, probability: float = 0.95) -> Pair
     """
     known = np.isfinite(a) & np.isfinite(b)
     a, b = a[known], b[known]
-    difference = mean_interval(a - b, probability)
+    difference = mean_interval(a - b)
     if difference is None:
         return None
     from scipy.stats import wilcoxon  # a second, and only trials need it

@@ -408,19 +408,6 @@ def pose_nees(estimate: FloatArray, covariances: FloatArray, truth: FloatArray) 
     return nees(pose_errors(estimate, truth), covariances)
 
 
-def landmark_nees(
-    positions: FloatArray, covariances: FloatArray, true_positions: FloatArray
-) -> Nees:
-    """NEES of landmarks, all in the same world.
-
-    Args:
-        positions: (n, 3) metres.
-        covariances: (n, 3, 3) metres squared.
-        true_positions: (n, 3) metres; NaN where the truth is unknown (left out).
-    """
-    return nees(true_positions - positions, covariances)
-
-
 def chi_square_band(dof: float, probability: float = 0.95) -> tuple[float, float]:
     """Two-sided band of a chi-square variable per degree of freedom: its quantiles over ``dof``."""
     tail = 0.5 * (1.0 - probability)

@@ -180,13 +180,23 @@ def _panel(k: int, prefix: str = "y") -> str:
     return f"{prefix}{k + 1 if k else ''}"
 
 
+BUTTONS = {
+    "type": "buttons",
+    "direction": "right",
+    "x": 1.0,
+    "xanchor": "right",
+    "y": 1.02,
+    "yanchor": "bottom",
+}
+"""A menu of buttons, above the figure at its right."""
+
+
 def _scales(*, log: bool) -> dict[str, Any]:
     """Layout of a figure whose values may span decades: two buttons choose the scale."""
     kinds = ("linear", "log")
     buttons = [{"label": k, "method": "relayout", "args": [{"yaxis.type": k}]} for k in kinds]
-    menu = {"type": "buttons", "direction": "right", "active": int(log), "buttons": buttons}
-    place = {"x": 1.0, "xanchor": "right", "y": 1.02, "yanchor": "bottom"}
-    return {"yaxis": {"type": kinds[log]}, "updatemenus": [menu | place]}
+    menu = BUTTONS | {"active": int(log), "buttons": buttons}
+    return {"yaxis": {"type": kinds[log]}, "updatemenus": [menu]}
 
 
 # --------------------------------------------------------------------------------------------

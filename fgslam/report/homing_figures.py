@@ -27,7 +27,17 @@ from fgslam.report.content import (
     peaks,
     world_position_covariances,
 )
-from fgslam.report.figures import HOVER_PLACE, MAX_POINTS, colour, curve, dots, drawing, line, plane
+from fgslam.report.figures import (
+    BUTTONS,
+    HOVER_PLACE,
+    MAX_POINTS,
+    colour,
+    curve,
+    dots,
+    drawing,
+    line,
+    plane,
+)
 
 _HOVER_TEXT = "%{text}<extra></extra>"
 
@@ -264,9 +274,8 @@ def _with_moments(
         {"label": "Play", "method": "animate", "args": [None, run]},
         {"label": "Stop", "method": "animate", "args": [[None], frame]},
     ]
-    menu = {"type": "buttons", "direction": "right", "showactive": False, "buttons": buttons}
-    place = {"x": 1.0, "xanchor": "right", "y": 1.02, "yanchor": "bottom"}
-    return figure.update_layout(sliders=[slider], updatemenus=[menu | place])
+    menu = BUTTONS | {"showactive": False, "buttons": buttons}
+    return figure.update_layout(sliders=[slider], updatemenus=[menu])
 
 
 def local_map_figure(

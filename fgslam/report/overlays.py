@@ -6,7 +6,6 @@ A frame takes milliseconds: every run draws some.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -231,24 +230,6 @@ def _draw_path(canvas: Image, points: FloatArray, colour: str, thickness: int) -
 # Frames of a film, one after the other
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Moment:
-    """One frame of a drive.
-
-    Attributes:
-        image: what the reference camera saw; None where it cannot be read.
-        before, after: (k, 2) pixels of the matched landmarks in the last frame and in this one.
-        new: (l, 2) pixels of landmarks seen for the first time.
-        title: above the image.
-    """
-
-    image: Image | None
-    before: FloatArray
-    after: FloatArray
-    new: FloatArray
-    title: str
-
-
 class FilmCanvas:
     """A drive: the image with its matches, next to the growing map."""
 
@@ -267,21 +248,37 @@ class FilmCanvas:
         room = wide - _FILM_IMAGE_PX - _MARGIN_PX, tall - 2 * _HEADING_PX
         self._plan, self._title = _Plan(path, landmarks, truth, room), title
 
-    def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
-        """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
+    def draw(
+        self,
+        image: Image | None,
+        seen: tuple[FloatArray, FloatArray, FloatArray],
+        title: str,
+        known: FloatArray,
+        row: int,
+    ) -> Image:
+        """The frame (540, 1280, 3) in red, green, blue.
+
+        Args:
+            image: what the reference camera saw; None where it cannot be read.
+            seen: pixels (k, 2) of the matched landmarks in the last frame and in this one, and
+                (l, 2) of landmarks seen for the first time.
+            title: above the image.
+            known: (m, 2) landmarks of the map.
+            row: of the present pose.
+        """
         whole = np.full((*_FILM_PX, 3), 255, np.uint8)
         plan = _headed(self._plan.drawn(known, row), self._title, "")
         whole[: len(plan), -plan.shape[1] :] = plan
         _put_text(whole, self._plan.words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
-        _put_text(whole, moment.title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
-        if moment.image is not None:
-            panel = self._with_matches(moment, moment.image)
+        _put_text(whole, title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
+        if image is not None:
+            panel = self._with_matches(image, seen)
             whole[_HEADING_PX : _HEADING_PX + len(panel), : panel.shape[1]] = panel
         words = "orange: matched, with its motion; yellow: new landmark"
         _put_text(whole, words, (_MARGIN_PX, _FILM_PX[0] - 16))
         return np.asarray(whole[..., ::-1])
 
-    def _with_matches(self, moment: Moment, image: Image) -> Image:
+    def _with_matches(self, image: Image, seen: tuple[FloatArray, ...]) -> Image:
         tall, wide = image.shape[:2]
         scale = min(_FILM_IMAGE_PX / wide, (_FILM_PX[0] - 2 * _HEADING_PX) / tall)
         dimmed = _dimmed(image)
@@ -292,9 +289,7 @@ class FilmCanvas:
         panel: Image = np.asarray(
             cv2.resize(coloured, size, interpolation=cv2.INTER_AREA), np.uint8
         )
-        start, end, new = (
-            scale * (pixels + 0.5) for pixels in (moment.before, moment.after, moment.new)
-        )
+        start, end, new = (scale * (pixels + 0.5) for pixels in seen)
         _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
         _draw_dots(panel, end, [_bgr(ORANGE)], 3)
         _draw_dots(panel, new, [_bgr(YELLOW)], 2)

@@ -94,16 +94,6 @@ def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
         axes.set_title(note, loc="right", fontweight="normal", fontsize=12.0)
 
 
-def colour_bar(axes: Axes, colours: ScalarMappable, label: str, extend: str = "neither") -> None:
-    """A colour bar exactly as tall as the axes, whatever their aspect."""
-    inset = axes.inset_axes((1.02, 0.0, 0.022, 1.0))
-    figure = axes.get_figure(root=True)
-    if figure is None:
-        raise ValueError("these axes belong to no figure")
-    bar = figure.colorbar(colours, cax=inset, label=label, extend=extend)
-    bar.outline.set_visible(False)
-
-
 def add_segments(axes: Axes, segments: FloatArray, width: float, colour: str) -> None:
     """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike."""
     # Two collections: as an effect of its path each line would be drawn by itself, and ten times
@@ -231,8 +221,11 @@ def _draw(axes: Any, trace: Any, order: int, names: str = "xy") -> None:
         norm = Normalize(marker.cmin, marker.cmax)
         axes.scatter(*points, c=marker.color, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
         if len(points) == 2:
-            bar = marker.colorbar.title.text
-            colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
+            # Exactly as tall as the axes, whatever their aspect.
+            inset = axes.inset_axes((1.02, 0.0, 0.022, 1.0))
+            of: dict[str, Any] = {"label": marker.colorbar.title.text, "extend": "both"}
+            bar = axes.figure.colorbar(ScalarMappable(norm, MAP_COLOURS), cax=inset, **of)
+            bar.outline.set_visible(False)
 
 
 def _dress(axes: Axes, layout: Any, panel: str) -> None:
@@ -278,29 +271,20 @@ _PAIR_DIMMED, _VIEW_DIMMED = 0.6, 0.7
 _EDGE_PART = 0.04  # of a picture: a mark with its number is no wider, nor as high
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MatchedPixels:
-    """Matches of two pictures.
-
-    Attributes:
-        a, b: (n, 2) column and row in either picture, from centre to centre.
-        columns: (n,) which are column segments: drawn as bars, the others as rings.
-    """
-
-    a: FloatArray
-    b: FloatArray
-    columns: BoolArray
-
-
 def draw_view_matches(
-    path: Path, images: tuple[Image, Image], matches: MatchedPixels, titles: tuple[str, str]
+    path: Path,
+    images: tuple[Image, Image],
+    pixels: tuple[FloatArray, FloatArray],
+    columns: BoolArray,
+    titles: tuple[str, str],
 ) -> None:
     """One picture above the other, each match with a number of its own colour in both.
 
     Args:
         path: of the PNG.
         images: (h, w, 3) red, green, blue.
-        matches: accepted ones.
+        pixels: (n, 2) column and row of the accepted matches in either, from centre to centre.
+        columns: (n,) which are column segments: drawn as bars, the others as rings.
         titles: above each picture.
 
     Raises:
@@ -308,15 +292,12 @@ def draw_view_matches(
     """
     aspect = images[0].shape[0] / images[0].shape[1]
     with picture(path, _PAIR_WIDTH_IN, 2.0 * (_PAIR_WIDTH_IN * aspect + 0.4)) as figure:
-        upper, lower = figure.subplots(2, 1)
         # Neighbours in bearing get neighbouring hues, so that a wrong match stands out.
-        order = np.argsort(np.argsort(matches.a[:, 0]))
+        order = np.argsort(np.argsort(pixels[0][:, 0]))
         hue = order / max(len(order), 1)
         colours = hsv_to_rgb(np.column_stack([hue, np.ones(len(hue)), np.ones(len(hue))]))
-        for axes, image, points, title in (
-            (upper, images[0], matches.a, titles[0]),
-            (lower, images[1], matches.b, titles[1]),
-        ):
+        panels = zip(figure.subplots(2, 1), images, pixels, titles, strict=True)
+        for axes, image, points, title in panels:
             step = max(1, image.shape[1] // _SHOWN_PX)
             height, width = image.shape[:2]
             dimmed = (_PAIR_DIMMED * image[::step, ::step]).astype(np.uint8)
@@ -329,7 +310,7 @@ def draw_view_matches(
             for number, point in enumerate(points.tolist()):
                 tint: Any = tuple(colours[number].tolist())
                 mark: dict[str, Any] = {"color": tint, "in_layout": bool(outer[number])}
-                if matches.columns[number]:
+                if columns[number]:
                     axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, **mark)
                 else:
                     axes.plot(*point, marker="o", markersize=5, fillstyle="none", **mark)
@@ -494,13 +475,6 @@ _DOTS = "#8a939c"
 _styled = matplotlib.style.context(PICTURE_STYLE, after_reset=True)
 
 
-def _pixels(figure: Canvas) -> Image:
-    """What a canvas shows, (height, width, 3) in red, green, blue."""
-    agg: Any = figure.canvas
-    agg.draw()
-    return np.asarray(agg.buffer_rgba())[..., :3].copy()
-
-
 _MOST_NAMED = 25  # path images whose numbers stand below the route
 _LINE = 26  # letters of a reason in a line
 _LINES = 5
@@ -591,7 +565,9 @@ class RouteCanvas:
             _draw_remembered(remembered, self._path[moment.nearest], moment.nearest)
         _draw_compass(compass, moment)
         _draw_route(route, moment, len(self._path) - 1)
-        return _pixels(self._figure)
+        agg: Any = self._figure.canvas
+        agg.draw()
+        return np.asarray(agg.buffer_rgba())[..., :3].copy()
 
 
 def _draw_remembered(axes: Axes, shown: PathPicture, number: int) -> None:

@@ -104,31 +104,11 @@ class EstimatorReport:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     @staticmethod
-    def unjudged(title: str, kind: str, estimate: Estimate) -> EstimatorReport:
-        """An estimate of which neither errors nor times nor first estimates are known."""
-        final, unknown = estimate.trajectory, np.full(len(estimate.trajectory), np.nan)
-        return EstimatorReport(
-            title=title,
-            kind=kind,
-            timestamps=final.timestamps,
-            final_poses=final.poses,
-            online_poses=np.full((len(final), 4, 4), np.nan),
-            covariances=estimate.covariances,
-            landmarks=estimate.landmarks,
-            final_error_m=unknown,
-            online_error_m=unknown,
-            nees=unknown,
-            update_ms=unknown,
-            predicted=np.zeros(len(final), np.bool_),
-            remarks=estimate.remarks,
-        )
-
-    @staticmethod
     def failed(title: str, kind: str, why: str) -> EstimatorReport:
         """An estimator that gave no result."""
         path = Trajectory(np.empty(0), np.empty((0, 4, 4)))
         nothing = Estimate(path, np.empty((0, 6, 6)), NO_LANDMARKS)
-        return replace(EstimatorReport.unjudged(title, kind, nothing), failure=why)
+        return replace(judged_report(title, kind, nothing, None, None), failure=why)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,32 +187,41 @@ def judged_report(
         online: each pose as first estimated, where that is known.
         truth: true poses in any world, where there are some.
     """
-    final, report = estimate.trajectory, EstimatorReport.unjudged(title, kind, estimate)
+    final, unknown = estimate.trajectory, np.full(len(estimate.trajectory), np.nan)
+    first: FloatArray = np.full((len(final), 4, 4), np.nan)
     if online is not None:
         rows, of = same_times(final.timestamps, online.timestamps)
-        poses = report.online_poses.copy()
-        poses[rows] = online.poses[of]
-        report = replace(report, online_poses=poses)
+        first[rows] = online.poses[of]
     sound = sound_truth(final, truth)
-    known = sound.trajectory
-    found = None if known is None else to_estimate_world(final, known)
-    report = replace(report, truth_remark=sound.why)
-    return report if found is None else _against_truth(report, *found, truth)
-
-
-def _against_truth(
-    report: EstimatorReport, rows: IntArray, true_poses: FloatArray, truth: Trajectory | None
-) -> EstimatorReport:
-    """The report with its errors; ``rows`` (k,) have the true poses (k, 4, 4) in its world."""
-    errors, online_errors, values = (np.full(len(report), np.nan) for _ in range(3))
-    errors[rows] = position_errors(report.final_poses[rows], true_poses)
-    online_errors[rows] = position_errors(report.online_poses[rows], true_poses)
-    found = pose_nees(report.final_poses[rows], report.covariances[rows], true_poses)
+    report = EstimatorReport(
+        title=title,
+        kind=kind,
+        timestamps=final.timestamps,
+        final_poses=final.poses,
+        online_poses=first,
+        covariances=estimate.covariances,
+        landmarks=estimate.landmarks,
+        final_error_m=unknown,
+        online_error_m=unknown,
+        nees=unknown,
+        update_ms=unknown,
+        predicted=np.zeros(len(final), np.bool_),
+        truth_remark=sound.why,
+        remarks=estimate.remarks,
+    )
+    located = None if sound.trajectory is None else to_estimate_world(final, sound.trajectory)
+    if located is None:
+        return report
+    rows, true_poses = located
+    errors, online_errors, values = (np.full(len(final), np.nan) for _ in range(3))
+    errors[rows] = position_errors(final.poses[rows], true_poses)
+    online_errors[rows] = position_errors(first[rows], true_poses)
+    found = pose_nees(final.poses[rows], estimate.covariances[rows], true_poses)
     per_dof = np.full(len(rows), np.nan)
     values[rows] = np.divide(found.values, found.dof, out=per_dof, where=found.dof > 0)
     usual = np.bincount(found.dof[found.dof > 0])
     judged = judge([Nees(found.values[1:], found.dof[1:])])  # the first pose is the gauge
-    aligned = evaluate_trajectory(report.final, truth, Alignment.SE3)
+    aligned = evaluate_trajectory(final, truth, Alignment.SE3)
     return replace(
         report,
         final_error_m=errors,

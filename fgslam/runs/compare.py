@@ -7,7 +7,6 @@ How a log is replayed and judged: :mod:`fgslam.runs.slam_comparison`, and for ho
 from __future__ import annotations
 
 import dataclasses
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.backend.settings import (
+    ESTIMATORS,
     AverageLandmarkVectorSettings,
     EstimatorSettings,
     HomingEkfSettings,
@@ -103,8 +103,7 @@ EVERY = Choice()
 
 def all_kinds() -> dict[str, EstimatorSettings]:
     """Every kind of SLAM estimator with its defaults, by kind."""
-    union = typing.get_args(EstimatorSettings)[0]
-    return {settings.kind: settings() for settings in typing.get_args(union)}
+    return {kind: settings() for kind, settings in ESTIMATORS.items()}
 
 
 def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
@@ -248,7 +247,7 @@ def compare_runs(
             failed = all(one.get("failure") for one in found)
             results.append(dataclasses.replace(result, failed=failed))
         else:
-            opener = partial(_give, task)
+            opener = partial(lambda opened, *_: opened, task)  # it is open already
             results.append(run_task(opener, now, folder, begun, progress, stopped, jobs))
     if out is not None and len(runs) > 1 and slam[0]:
         names = _distinct([one.config.name for one in results], results)
@@ -256,11 +255,6 @@ def compare_runs(
             out / COMPARISON_FILE, list(zip(names, map(_values_of, results), strict=True))
         )
     return results
-
-
-def _give(task: Task[RunResult], *_: object) -> Task[RunResult]:
-    """A task that is open already."""
-    return task
 
 
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:

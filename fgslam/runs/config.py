@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
@@ -98,7 +99,12 @@ def parse(
         return model.model_validate(plain)
     except ValidationError as error:
         wrong = error.errors()
-    texts = {tuple(_followed(model, e["loc"])[0]) for e in wrong if _wants_text(e)}
+    texts = {
+        tuple(_followed(model, e["loc"])[0])
+        for e in wrong
+        if e["type"] == "string_type"
+        or (e["type"] == "literal_error" and isinstance(e["input"], bool | None))
+    }
     for override in given:
         override.apply(plain, override.text if override.keys in texts else override.value)
     try:
@@ -174,12 +180,6 @@ def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> list[Ov
 def _kind(values: Mapping[str, Any], group: str) -> Any:
     inner = values.get(group)
     return inner.get("kind") if isinstance(inner, dict) else None
-
-
-def _wants_text(error: ErrorDetails) -> bool:
-    return error["type"] == "string_type" or (
-        error["type"] == "literal_error" and isinstance(error["input"], bool | None)
-    )
 
 
 # --------------------------------------------------------------------------------------------
@@ -366,6 +366,8 @@ class Experiment(BaseModel):
     )
     taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first", "units")
     """Folders of a run that no estimator may be called."""
+    written: ClassVar[tuple[str, ...]] = ()
+    """Keys of files that it writes outside the run folder, where they have a name."""
 
     name: str = Field(
         pattern=r"^[.-]*\w[\w.-]*$", description="short name; the default run folder's"
@@ -399,7 +401,8 @@ class Experiment(BaseModel):
     @property
     def outputs(self) -> tuple[Path, ...]:
         """Files that it writes outside the run folder."""
-        return ()
+        named = (attrgetter(key)(self) for key in self.written)
+        return tuple(Path(one) for one in named if one is not None)
 
     @property
     def inputs(self) -> tuple[Path, ...]:
@@ -447,6 +450,8 @@ def _paths_in(values: Any, key: str = "") -> Iterator[str]:
 class ExperimentConfig(Experiment):
     """One experiment."""
 
+    written: ClassVar[tuple[str, ...]] = ("map.save",)
+
     dataset: DatasetSettings
     odometry: OdometrySettings = RecordedOdometrySettings()
     frontend: FrontendSettings = FrontendSettings()
@@ -463,11 +468,6 @@ class ExperimentConfig(Experiment):
         "begins with and adds to: `off`, a file, or `auto`: a file next to the calibration's",
     )
     output: OutputSettings = OutputSettings()
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """The map, where a name is given."""
-        return () if self.map.save is None else (Path(self.map.save),)
 
     @property
     def on_measurements(self) -> bool:
@@ -601,6 +601,8 @@ class OmniVideoConfig(HomingExperiment):
 class TeachConfig(HomingExperiment):
     """A route chosen from a recording of an omnidirectional camera."""
 
+    written: ClassVar[tuple[str, ...]] = ("route",)
+
     task: Annotated[Literal["teach"], _TASK]
     dataset: OmniDatasetSettings
     route: str | None = Field(
@@ -611,11 +613,6 @@ class TeachConfig(HomingExperiment):
         description="trajectory of SLAM on the same drive, by the same clock: a TUM file; a "
         "covariance.csv next to it is taken, too; null: a route without metres",
     )
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """The route, where a name is given."""
-        return () if self.route is None else (Path(self.route),)
 
 
 class FollowConfig(HomingExperiment):
@@ -638,16 +635,13 @@ class FollowConfig(HomingExperiment):
 class JoinConfig(HomingExperiment):
     """Taught routes as one map, joined where their views match."""
 
+    written: ClassVar[tuple[str, ...]] = ("map",)
+
     task: Annotated[Literal["join"], _TASK]
     routes: tuple[str, ...] = Field(
         min_length=1, description="files that routes were taught into; named after them"
     )
     map: str | None = Field(default=None, description="file to write; null: RUN/routes.fgmap alone")
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """The map, where a name is given."""
-        return () if self.map is None else (Path(self.map),)
 
 
 class HomingTrialsConfig(HomingExperiment):

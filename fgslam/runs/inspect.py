@@ -23,6 +23,7 @@ from fgslam.datasets.layouts import kitti_drives
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.datasets.times import rows_at
+from fgslam.evaluation.statistics import path_length
 from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.findings import (
@@ -254,8 +255,8 @@ def check_truth(sequence: ImageSequence) -> tuple[Finding, ...]:
     if truth is None or len(truth) == 0:
         return (finding("no_truth"),)
     matched = int((rows_at(truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S) >= 0).sum())
-    length = float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).sum())
-    covers = finding("truth_covers", share=share(matched, len(sequence)), length=length)
+    covered = {"share": share(matched, len(sequence)), "length": path_length(truth.poses)}
+    covers = finding("truth_covers", **covered)
     jumps = _jumps(truth)
     if not jumps:
         return (covers,)

@@ -516,6 +516,14 @@ class Slam(Session):
             MapError: the map of `map.load` cannot be read, is empty, or was made by other cameras.
         """
         settings = slam_config(config, overrides)
+        start, maps = None, settings.map
+        if maps.made_from is not None:
+            raise ConfigError(
+                f"{settings.name}: its map is made by a drive of its own; use fgslam.run, or "
+                "Slam(start_map=...) with a map that is there"
+            )
+        if maps.load is not None:
+            start = MapStart(load_map(Path(maps.load)), maps, maps.load)
         slam = cls(
             open_sequence(settings).rig if rig is None else rig,
             settings.estimator,
@@ -523,7 +531,7 @@ class Slam(Session):
             odometry=settings.odometry,
             features=features,
             seed=settings.seed,
-            start_map=_beginning(settings),
+            start_map=start,
         )
         slam.numbering = (settings.dataset.start, settings.dataset.stride)
         slam._remark = settings.remark
@@ -583,19 +591,6 @@ _CHANNELS = ((3,), (4,))  # of images in colour
 def _eight_bits(image: npt.ArrayLike) -> Image:
     pixels = np.asarray(image)
     return np.asarray(pixels >> 8 if pixels.dtype == np.uint16 else pixels, np.uint8)
-
-
-def _beginning(config: ExperimentConfig) -> MapStart | None:
-    """The map that an experiment loads; None where it begins with an empty one."""
-    settings = config.map
-    if settings.made_from is not None:
-        raise ConfigError(
-            f"{config.name}: its map is made by a drive of its own; use fgslam.run, or "
-            "Slam(start_map=...) with a map that is there"
-        )
-    if settings.load is None:
-        return None
-    return MapStart(load_map(Path(settings.load)), settings, settings.load)
 
 
 def slam_config(

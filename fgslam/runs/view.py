@@ -42,7 +42,7 @@ from fgslam.report.content import (
     world_position_covariances,
 )
 from fgslam.report.formats import read_ply
-from fgslam.report.overlays import FilmCanvas, Moment
+from fgslam.report.overlays import FilmCanvas
 from fgslam.report.pictures import PathPicture, RouteCanvas, RouteMoment
 from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.config import (
@@ -171,8 +171,8 @@ def _film_of_slam(run: Path, estimator: str | None) -> tuple[FloatArray, Iterato
             title = f"{seconds:.1f} s: {len(after)} matched"
             images = _readable(pictures, int(frame_at[row]))
             image = None if images is None else images[0]
-            moment = Moment(image, before, after, now.measurement[now.is_new, :2], title)
-            yield canvas.draw(moment, above[seen], row)
+            shown = before, after, now.measurement[now.is_new, :2]
+            yield canvas.draw(image, shown, title, above[seen], row)
             last = increment
 
     return trajectory.timestamps, frames()

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from fgslam.cameras.omni import OmniCamera
+from fgslam.cameras.omni import unit_rays
 from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile
 from fgslam.core.bearings import (
     BearingMatches,
@@ -769,7 +769,7 @@ def _draw_pair(
     folder: Path, views: OmniRecording, search: PairSearch, answer: PairAnswer
 ) -> Picture:
     """One pair: its accepted matches on both views."""
-    from fgslam.report.pictures import MatchedPixels, draw_view_matches
+    from fgslam.report.pictures import draw_view_matches
 
     vector, matches = search.answer(answer.a, answer.b)
     kept, caption = matches.select(np.zeros(len(matches), np.bool_)), "refused"
@@ -780,19 +780,12 @@ def _draw_pair(
             f"{vector.support} of {len(matches)} matches, direction {direction:.1f}, "
             f"rotation {rotation:.1f} degrees"
         )
-    pixels = MatchedPixels(
-        _pixels(views.camera, kept.bearing_a, kept.elevation_a),
-        _pixels(views.camera, kept.bearing_b, kept.elevation_b),
-        kept.kind == FeatureKind.COLUMN,
-    )
+    here = views.camera.pixels(unit_rays(kept.bearing_a, kept.elevation_a))
+    there = views.camera.pixels(unit_rays(kept.bearing_b, kept.elevation_b))
     a, b = view_names(views)[answer.a], view_names(views)[answer.b]
     images = views.image(answer.a), views.image(answer.b)
     titles = (f"view {a}: {caption}", f"view {b}")
-    draw = partial(draw_view_matches, images=images, matches=pixels, titles=titles)
+    seen: dict[str, Any] = {"pixels": (here, there), "columns": kept.kind == FeatureKind.COLUMN}
+    draw = partial(draw_view_matches, images=images, titles=titles, **seen)
     about = f"Matches of views {a} and {b}: {caption}"
     return draw_picture(folder, f"matches_{a}_{b}.png", about, draw)
-
-
-def _pixels(camera: OmniCamera, bearing: FloatArray, elevation: FloatArray) -> FloatArray:
-    rays = np.column_stack([np.cos(bearing), np.sin(bearing), np.tan(elevation)])
-    return camera.pixels(rays)

@@ -24,7 +24,6 @@ from fgslam.core.files import make_subfolder
 from fgslam.core.geometry import congruence, rotate_covariances, transform_to_camera, yaw_pitch_roll
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
-from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import NO_LANDMARKS, Floor, LandmarkMap, Relocalisation, StereoFeatures
 from fgslam.datasets.settings import OdometrySettings
@@ -278,7 +277,11 @@ def submap_features(
     keep = np.abs(points[:, 2]) > _NEAREST_M
     points, covariances = points[keep], covariances[keep]
     views = views.of(landmarks.ids[keep])
-    measurement, noise = _measured(rig, points, covariances)
+    # As measured in the image; NaN of those behind the camera.
+    before = points[:, 2] > 0.0
+    measurement, noise = np.full((len(points), 3), np.nan), np.full((len(points), 3, 3), np.nan)
+    measurement[before] = rig.predict(points[before])
+    noise[before] = congruence(rig.jacobian(points[before]), covariances[before])
     pixels = np.full((len(points), 3, 2), np.nan)
     pixels[:, 0] = measurement[:, :2]
     features = StereoFeatures(
@@ -292,18 +295,6 @@ def submap_features(
         pixels=pixels,
     )
     return features, stats.covariance
-
-
-def _measured(
-    rig: CameraRig, points: FloatArray, covariances: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Image measurements (n, 3) of points and their covariances; NaN of those behind the camera."""
-    before = points[:, 2] > 0.0
-    measurement = np.full((len(points), 3), np.nan)
-    noise = np.full((len(points), 3, 3), np.nan)
-    measurement[before] = rig.predict(points[before])
-    noise[before] = congruence(rig.jacobian(points[before]), covariances[before])
-    return measurement, noise
 
 
 # ------------------------------------------------------------------------------------------

@@ -23,16 +23,15 @@ from fgslam.runs.tables import FRAMES_FILE
 _NUMBERS = ("inliers", "solve_ms", "update_ms")
 
 
-def open_measured(config: ExperimentConfig, seed: int | None = None) -> MeasurementRecording:
-    """The recording that the configuration names, simulated with its seed or another one.
+def open_measured(config: ExperimentConfig) -> MeasurementRecording:
+    """The recording that the configuration names, simulated with its seed.
 
     Raises:
         FgslamError: it cannot be opened; images are no measurements (ConfigError).
     """
     if not isinstance(config.dataset, MeasurementDatasetSettings):
         raise ConfigError(f"dataset.kind {config.dataset.kind} holds images, no measurements")
-    seed = config.seed if seed is None else seed
-    return open_measurements(config.dataset, seed, config.odometry)
+    return open_measurements(config.dataset, config.seed, config.odometry)
 
 
 def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[RunResult]:

@@ -16,7 +16,6 @@ from fgslam.evaluation.statistics import (
     end_pose,
     evaluate_trajectory,
     judge,
-    landmark_nees,
     nees,
     pose_errors,
     pose_nees,
@@ -240,7 +239,7 @@ def test_an_exactly_known_pose_adds_no_degrees_of_freedom() -> None:
 
 def test_unknown_truth_is_left_out() -> None:
     truth = np.array([[1.0, 2.0, 3.0], [np.nan] * 3])
-    result = landmark_nees(np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), truth)
+    result = nees(truth, np.tile(np.eye(3), (2, 1, 1)))
     np.testing.assert_allclose(result.values, [14.0, 0.0])
     np.testing.assert_array_equal(result.dof, [3, 0])
 
