@@ -25,7 +25,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import Increment
 from fgslam.core.types import Estimate, Prediction, UpdateStats
-from fgslam.evaluation.statistics import Nees, judge, landmark_nees, pose_nees
+from fgslam.evaluation.statistics import Nees, judge, nees, pose_nees
 from fgslam.factors import graphs
 from fgslam.factors.noise import plain
 from fgslam.frontend.settings import EgoMotionSettings
@@ -93,8 +93,8 @@ def nees_of(estimate: Estimate, simulation: Simulation) -> tuple[Nees, Nees]:
     """Of the poses and of the landmarks."""
     truth = simulation.points_by_id[estimate.landmarks.ids]
     poses = estimate.trajectory.poses[1:], estimate.covariances[1:], simulation.poses[1:]
-    landmarks = estimate.landmarks.positions, estimate.landmarks.covariances, truth
-    return pose_nees(*poses), landmark_nees(*landmarks)
+    landmarks = estimate.landmarks
+    return pose_nees(*poses), nees(truth - landmarks.positions, landmarks.covariances)
 
 
 def assert_consistent(settings: EstimatorSettings, count: int = 20) -> None:
