@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import dijkstra
+from scipy import ndimage
+from skimage.graph import MCP_Geometric
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
@@ -205,7 +205,7 @@ def _moved(pose: FloatArray, offsets: FloatArray) -> FloatArray:
 #
 # A tour of the house's rooms gives the direction; a depth-first search lays targets a fixed
 # distance apart so that each leg's straight line is free for the wheelchair, and steps back where
-# it gets stuck. Ways around corners are measured on a grid by Dijkstra's algorithm.
+# it gets stuck. Ways around corners are measured on a grid by Dijkstra's algorithm (scikit-image).
 
 
 # A closed walk through the house: every room, and the corridor twice.
@@ -229,23 +229,9 @@ class PathPlanner:
         """For paths that keep ``clearance`` metres from everything."""
         self._space, self._clearance = space, clearance
         free = space.clearances[::_SKIP, ::_SKIP] >= clearance
-        number = np.arange(free.size).reshape(free.shape)
-        pairs, weights = [], []
-        everything, ahead, behind = slice(None), slice(1, None), slice(None, -1)
-        for first, second, length in (
-            ((everything, behind), (everything, ahead), 1.0),
-            ((behind, everything), (ahead, everything), 1.0),
-            ((behind, behind), (ahead, ahead), np.sqrt(2.0)),
-            ((behind, ahead), (ahead, behind), np.sqrt(2.0)),
-        ):
-            both = free[first] & free[second]
-            pairs.append(np.stack([number[first][both], number[second][both]]))
-            weights.append(np.full(int(both.sum()), length * (space.cell * _SKIP)))
-        entries = (np.concatenate(weights), tuple(np.hstack(pairs)))
-        self._graph = sparse.csr_matrix(entries, shape=(free.size, free.size))
-        parts = sparse.csgraph.connected_components(self._graph, directed=False)[1]
-        largest = np.argmax(np.bincount(parts[free.ravel()]))
-        self._shape, self._inside = free.shape, free.ravel() & (parts == largest)
+        self._metres = np.where(free, space.cell * _SKIP, -1.0)  # to a neighbour; below 0: no way
+        parts, _ = ndimage.label(free, np.ones((3, 3)))
+        self._inside = parts == 1 + np.argmax(np.bincount(parts[free])[1:])
 
     def reference_path(self, spacing: float, legs: int, rng: np.random.Generator) -> FloatArray:
         """(legs + 1, 3) poses, start first, each headed to the next one.
@@ -313,8 +299,8 @@ class PathPlanner:
         def way(goal: int, places: FloatArray) -> FloatArray:
             """(n,) metres to drive from places (n, 2) to one of the tour's."""
             if goal not in ways:
-                start = int(self._cells(tour[goal][None])[0])
-                ways[goal] = np.asarray(dijkstra(self._graph, directed=False, indices=start))
+                start = np.unravel_index(self._cells(tour[goal][None])[0], self._inside.shape)
+                ways[goal] = MCP_Geometric(self._metres).find_costs([start])[0].ravel()
             cells = self._cells(places)
             return np.where(cells >= 0, ways[goal][cells], np.inf)
 
@@ -372,10 +358,10 @@ class PathPlanner:
         """(n,) numbers of the cells that hold points (n, 2), -1 outside the connected floor."""
         at = (points - self._space.low) / (self._space.cell * _SKIP)
         column, row = np.floor(at).astype(int).T
-        rows, columns = self._shape
+        rows, columns = self._inside.shape
         valid = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         number = np.where(valid, row * columns + column, 0)
-        return np.where(valid & self._inside[number], number, -1)
+        return np.where(valid & self._inside.ravel()[number], number, -1)
 
 
 def _with_headings(points: FloatArray) -> FloatArray:
