@@ -21,7 +21,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.worlds.people import WALK_FRAMES
 
 VOXEL_M = 0.04
-WIDE_M = 0.15  # to the default as 10 cm to 6 in the prototype, whose deviations were smaller
+WIDE_M = 0.15
 _SAMPLES = 300_000
 _FAR_M = 0.15  # of the room's surfaces: a vertex there is of the person
 _HEIGHTS_M = np.arange(0.15, 1.95, 0.1)

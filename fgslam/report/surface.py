@@ -1,8 +1,8 @@
 """Depth images of a drive as one coloured surface with its deviation, and as a grid to drive by.
 
 A truncated signed distance on Open3D's blocks of voxels (Curless and Levoy 1996), weighed by the
-inverse variance that the ray's depth has there; so what stands in free space, seen through later,
-is carved away. docs/howto/dense_map.md.
+inverse variance that the ray's depth has there; what a ray surely passes through is free from then
+on, so that a person who has left is gone. docs/howto/dense_map.md.
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from fgslam.report.formats import (
 )
 
 TRUNCATION_VOXELS = 4.0
-KEPT_SIGMA_VOXELS = 2.25
+KEPT_SIGMA_VOXELS = 2.0  # half of the truncation: what is off by two of them is not clipped
+_LATTICE = 0.5  # voxels: no edge or corner is known better
 _GRAZING = np.float32(0.2)  # sine of the flattest angle at which the ground is known by its normal
-_ALIKE = 0.1  # correlation of the errors of two frames, in the rendered lab
 _SIDE = 8  # voxels of a block
+_VOXELS = _SIDE**3
 _OFFSETS = np.stack(np.meshgrid(*(np.arange(_SIDE),) * 3, indexing="ij"), -1)[..., ::-1]
 _OFFSETS = _OFFSETS.reshape(-1, 3).astype(np.float32)  # x runs fastest, as in Open3D's blocks
-_ATTRIBUTES = {"tsdf": 1, "weight": 1, "color": 3, "scatter": 1, "count": 1, "shared": 1}
+_ATTRIBUTES = {"tsdf": 1, "weight": 1, "color": 3, "shared": 1}
+_AT_ONCE = 100  # blocks, whose temporary arrays stay in the processor's cache
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,44 +64,63 @@ class DepthFrame:
 class Fusion:
     """The signed distance of the nearest surface, in voxels around all that was seen."""
 
-    def __init__(self, matrix: FloatArray, voxel_m: float) -> None:
-        """Empty; ``matrix`` (3, 3) are the camera's intrinsics."""
-        self._o3d = load_open3d()
-        o3c = self._o3d.core
-        self._matrix, self.voxel_m = matrix, voxel_m
+    def __init__(self, matrix: FloatArray, voxel_m: float, range_m: float = np.inf) -> None:
+        """Empty; ``matrix`` (3, 3) are the camera's intrinsics, ``range_m`` bounds the depth."""
+        self._matrix, self.voxel_m, self._range_m = matrix, voxel_m, range_m
         self._truncation = np.float32(TRUNCATION_VOXELS * voxel_m)
-        self._grid = self._o3d.t.geometry.VoxelBlockGrid(
-            tuple(_ATTRIBUTES),
-            (o3c.float32,) * len(_ATTRIBUTES),
-            tuple((n,) for n in _ATTRIBUTES.values()),
-            voxel_m,
-            _SIDE,
-            4000,
-            o3c.Device("CPU:0"),
-        )
+        # Open3D's own map takes 0.1 ms for each block when it grows: it is filled at the end.
+        self._rows: dict[tuple[int, ...], int] = {}  # of blocks
+        self._blocks: npt.NDArray[np.int32] = np.empty((0, 3), np.int32)
+        self._values = {name: np.empty((0, n), np.float32) for name, n in _ATTRIBUTES.items()}
+        self._finder = self._grid(1)
 
-    def add(self, frame: DepthFrame) -> None:
-        """Integrates one depth image; one without any depth changes nothing."""
-        if not frame.depth.any():
-            return
+    def _grid(self, blocks: int) -> Any:
+        self._o3d, count = load_open3d(), len(_ATTRIBUTES)
+        kinds, sizes = (self._o3d.core.float32,) * count, tuple((n,) for n in _ATTRIBUTES.values())
+        device = self._o3d.core.Device("CPU:0")
+        grid = self._o3d.t.geometry.VoxelBlockGrid
+        return grid(tuple(_ATTRIBUTES), kinds, sizes, self.voxel_m, _SIDE, blocks, device)
+
+    def add(self, frame: DepthFrame) -> Float32:
+        """Integrates one depth image; (height, width) of it what is known well enough, else 0.
+
+        The rest of it shows what is free.
+        """
+        sure = (frame.depth > 0.0) & (frame.depth < self._range_m)
+        sure &= frame.sigma * frame.depth**2 < 2.0 * self._truncation
+        sure_depth = np.where(sure, frame.depth, np.float32(0.0))
+        if not sure_depth.any():
+            return sure_depth
         tensor, cTw = self._o3d.core.Tensor, inverse(frame.wTc)
-        seen = self._grid.compute_unique_block_coordinates(
-            self._o3d.t.geometry.Image(tensor(frame.depth[:, :, None].copy())),
+        seen = self._finder.compute_unique_block_coordinates(
+            self._o3d.t.geometry.Image(tensor(sure_depth[:, :, None].copy())),
             tensor(self._matrix),
             tensor(cTw),
             1.0,
-            float(frame.depth.max()) + 1.0,
+            float(sure_depth.max()) + 1.0,
             TRUNCATION_VOXELS,
         ).numpy()
-        self._grid.hashmap().activate(tensor(seen))
-        known = self._grid.hashmap().active_buf_indices().numpy().astype(np.int64)
-        keys = self._grid.hashmap().key_tensor().numpy()
-        carved = known[self._before(keys[known], frame, cTw)]
-        rows = np.union1d(carved, self._rows(seen))
-        blocks = keys[rows]
+        carved = np.flatnonzero(self._before(self._blocks, frame, cTw))
+        at = [self._rows.setdefault(each, len(self._rows)) for each in map(tuple, seen.tolist())]
+        self._blocks = np.concatenate([self._blocks, seen[np.array(at) >= len(self._blocks)]])
+        for name, values in self._values.items():
+            if len(values) < len(self._blocks) * _VOXELS:
+                grown = np.zeros((2 * len(self._blocks) * _VOXELS, values.shape[1]), np.float32)
+                grown[: len(values)] = values
+                self._values[name] = grown
+        sine = self._grazing(frame.depth)
+        rows = np.union1d(carved, at)
+        for part in np.array_split(rows, -(-len(rows) // _AT_ONCE)):
+            self._integrate(part, frame, cTw, sine, sure)
+        return sure_depth
+
+    def _integrate(
+        self, rows: IntArray, frame: DepthFrame, cTw: FloatArray, sine: Float32, sure: BoolArray
+    ) -> None:
+        """Weighted means of what voxels of some blocks are shown."""
         # In the camera's frame: a block's corner and its voxels' offsets.
         rotation = cTw[:3, :3].astype(np.float32) * np.float32(self.voxel_m)
-        corners = blocks @ (_SIDE * rotation.T) + cTw[:3, 3].astype(np.float32)
+        corners = self._blocks[rows] @ (_SIDE * rotation.T) + cTw[:3, 3].astype(np.float32)
         x, y, z = (
             np.add.outer(corner, offset).ravel()
             for corner, offset in zip(corners.T, rotation @ _OFFSETS.T, strict=True)
@@ -107,20 +128,22 @@ class Fusion:
         pixel = self._pixels(x, y, z, frame.depth.shape)
         use = np.flatnonzero(pixel >= 0)
         pixel, z = pixel[use], z[use]
-        depth = frame.depth.ravel()[pixel]
-        apart = (depth - z) * self._grazing(frame.depth).ravel()[pixel]
-        near = (depth > 0.0) & (apart >= -self._truncation)
-        use, pixel, z, apart = use[near], pixel[near], z[near], apart[near]
-        sigma = frame.sigma.ravel()[pixel] * z * z
-        tsdf = np.minimum(apart / self._truncation, np.float32(1.0))
-        at = (rows[:, None] * _SIDE**3 + np.arange(_SIDE**3)).ravel()[use]
-        share = self._take_in(at, 1.0 / (sigma * sigma), tsdf)
-        near = np.flatnonzero(tsdf < 1.0)  # what is seen through has no colour
-        at, pixel, share = at[near], pixel[near], share[near]
-        shared, colour = self._array("shared"), self._array("color")
-        shared[at] += share * (frame.shared.ravel()[pixel] - shared[at])
-        shown = frame.image.reshape(frame.depth.size, -1)[pixel]
-        colour[at] += share[:, None] * (shown - colour[at])
+        depth, sigma = frame.depth.ravel()[pixel], frame.sigma.ravel()[pixel]
+        apart, known = (depth - z) * sine.ravel()[pixel], sure.ravel()[pixel]
+        free = apart > self._truncation + 2.0 * sigma * depth**2
+        near = np.flatnonzero(free | known & (apart >= -self._truncation))
+        use, pixel, z, apart, free = use[near], pixel[near], z[near], apart[near], free[near]
+        at = (rows[:, None] * _VOXELS + np.arange(_VOXELS)).ravel()[use]
+        tsdf, total, colour, shared = self._values.values()
+        # What a ray surely passes through is free from now on, whatever stood there before.
+        before, weight = np.where(free, 0.0, total[at, 0]), 1.0 / (sigma[near] * z * z) ** 2
+        total[at, 0] = before + weight
+        share = weight / total[at, 0]
+        tsdf[at, 0] += share * (np.minimum(apart / self._truncation, 1.0) - tsdf[at, 0])
+        near = np.flatnonzero(~free)  # what is seen through has no colour
+        at, pixel, share = at[near], pixel[near], share[near, None]
+        shared[at] += share * (frame.shared.reshape(-1, 1)[pixel] - shared[at])
+        colour[at] += share * (frame.image.reshape(frame.depth.size, -1)[pixel] - colour[at])
 
     def _grazing(self, depth: Float32) -> Float32:
         """Sine of the angle (height, width) at which each ray meets the ground.
@@ -128,35 +151,12 @@ class Fusion:
         Of the slope from row to row, the lesser of both sides: at an edge one of them is a step.
         """
         _, fy, cy = self._matrix[1].astype(np.float32)
-        near = np.where(depth > 0.0, 1.0 / np.maximum(depth, 1e-3), np.inf).astype(np.float32)
-        with np.errstate(invalid="ignore"):
-            steps = np.diff(near, axis=0, prepend=np.inf, append=np.inf)
-            slope = np.fmin(np.abs(steps[1:]), np.abs(steps[:-1]))
-            slope[~((steps[1:] > 0.0) & (steps[:-1] > 0.0) & np.isfinite(slope))] = 0.0
-            rows = np.arange(len(depth), dtype=np.float32)[:, None] - cy
-            sine = near / np.hypot(fy * slope, near - rows * slope)
-        return np.where(np.isfinite(sine), np.maximum(sine, _GRAZING), np.float32(1.0))
-
-    def _take_in(self, at: IntArray, weight: Float32, tsdf: Float32) -> Float32:
-        """Weighted means (West 1979) at voxels (n,), each once; the weights' shares in the sums."""
-        mean, total, scatter = map(self._array, ("tsdf", "weight", "scatter"))
-        before, weights = mean[at], total[at] + weight
-        share, change = weight / weights, tsdf - before
-        mean[at], total[at] = before + share * change, weights
-        scatter[at] += (weight - weight * share) * change * change
-        self._array("count")[at] += 1.0
-        return share
-
-    def _array(self, name: str) -> Float32:
-        """Of all voxels, (n,) or (n, 3), to be written in place until blocks are added."""
-        values = self._grid.attribute(name).numpy()
-        return np.asarray(values.reshape(-1, _ATTRIBUTES[name]).squeeze())
-
-    def _rows(self, blocks: IntArray) -> IntArray:
-        """(n,) where the attributes of blocks (n, 3) lie; -1 of those that are not there."""
-        tensor = self._o3d.core.Tensor(np.ascontiguousarray(blocks, np.int32))
-        rows, found = self._grid.hashmap().find(tensor)
-        return np.where(found.numpy(), rows.numpy().astype(np.int64), -1)
+        near = np.where(depth > 0.0, 1.0 / np.maximum(depth, 1e-3), np.nan).astype(np.float32)
+        steps = np.diff(near, axis=0, prepend=np.nan, append=np.nan)
+        slope = np.minimum(steps[1:], steps[:-1]).clip(0.0)
+        rows = np.arange(len(depth), dtype=np.float32)[:, None] - cy
+        sine = near / np.hypot(fy * slope, near - rows * slope)
+        return np.asarray(np.nan_to_num(np.maximum(sine, _GRAZING), nan=1.0), np.float32)
 
     def _pixels(self, x: Float32, y: Float32, z: Float32, shape: tuple[int, ...]) -> IntArray:
         """(n,) nearest pixels, counted row by row, of points in the camera's frame; -1 outside."""
@@ -166,44 +166,49 @@ class Fusion:
         inside = (z > 0.0) & (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
         return np.where(inside, v * np.float32(shape[1]) + u, np.float32(-1.0)).astype(np.int32)
 
-    def _before(self, blocks: IntArray, frame: DepthFrame, cTw: FloatArray) -> BoolArray:
+    def _before(
+        self, blocks: npt.NDArray[np.int32], frame: DepthFrame, cTw: FloatArray
+    ) -> BoolArray:
         """Whether the frame sees through each of blocks (n, 3)."""
-        side = _SIDE * self.voxel_m
-        middles = (blocks + 0.5) * side @ cTw[:3, :3].T + cTw[:3, 3]
+        middles = (blocks + 0.5) * (_SIDE * self.voxel_m) @ cTw[:3, :3].T + cTw[:3, 3]
         x, y, z = middles.T.astype(np.float32)
         pixel = self._pixels(x, y, z, frame.depth.shape)
         depth = np.where(pixel >= 0, frame.depth.ravel()[pixel], 0.0)
         return np.asarray(depth > z + self._truncation)
 
     def surface(self, kept_sigma_m: float) -> Surface:
-        """The surface where its deviation along the rays is at most so much."""
-        weight, count = self._array("weight"), self._array("count")
-        # Images that contradict each other more than they should know less than they state, and
-        # what they have in common no mean takes away.
-        spread = self._array("scatter") * self._truncation**2 / np.maximum(count - 1.0, 1.0)
-        weight /= np.maximum(spread, 1.0) * (1.0 + _ALIKE * np.maximum(count - 1.0, 0.0))
-        if not (weight >= kept_sigma_m**-2).any():
+        """The surface where what the images measured deviates by at most so much along the rays."""
+        if not (self._values["weight"] >= kept_sigma_m**-2).any():
             return Surface.empty()
-        mesh = self._grid.extract_triangle_mesh(kept_sigma_m**-2)
+        grid, count = self._grid(len(self._blocks)), len(self._blocks) * _VOXELS
+        tensor = self._o3d.core.Tensor
+        grid.hashmap().activate(tensor(self._blocks))
+        rows = grid.hashmap().find(tensor(self._blocks))[0].numpy()
+        for name, values in self._values.items():
+            shown = grid.attribute(name).numpy().reshape(-1, _VOXELS, values.shape[1])
+            shown[rows] = values[:count].reshape(-1, _VOXELS, values.shape[1])
+        mesh = grid.extract_triangle_mesh(kept_sigma_m**-2)
         columns = [mesh.vertex[name].numpy() for name in ("positions", "normals", "colors")]
         # Open3D's order changes from call to call, and which of two equal vertices it takes.
-        rows, place = np.unique(np.nan_to_num(np.hstack(columns)), axis=0, return_inverse=True)
-        vertices, normals, colours = rows[:, :3], rows[:, 3:6], rows[:, 6:]
+        found, place = np.unique(np.nan_to_num(np.hstack(columns)), axis=0, return_inverse=True)
+        vertices, normals, colours = found[:, :3], found[:, 3:6], found[:, 6:]
         triangles = place.ravel().astype(np.int32)[mesh.triangle.indices.numpy()]
         triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
         first = triangles.argmin(axis=1)[:, None]
         triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
-        nearest = np.rint(vertices / self.voxel_m).astype(np.int64)
+        nearest = np.rint(vertices / self.voxel_m).astype(np.int32)
         block = np.floor_divide(nearest, _SIDE)
         x, y, z = (nearest - _SIDE * block).T
-        at = self._rows(block) * _SIDE**3 + x + _SIDE * (y + _SIDE * z)
+        rows = grid.hashmap().find(tensor(np.ascontiguousarray(block)))[0].numpy()
+        at = rows.astype(np.int64) * _VOXELS + x + _SIDE * (y + _SIDE * z)
+        weight, shared = (grid.attribute(each).numpy().ravel()[at] for each in ("weight", "shared"))
         return Surface(
             np.ascontiguousarray(vertices),
             triangles[np.lexsort(triangles.T)],
             np.ascontiguousarray(normals),
             np.rint(255.0 * colours).clip(0, 255).astype(np.uint8),
-            np.sqrt(1.0 / weight[at]),
-            np.sqrt(self._array("shared")[at]),
+            np.sqrt(1.0 / weight + np.float32(_LATTICE * self.voxel_m) ** 2),
+            np.sqrt(shared),
         )
 
 

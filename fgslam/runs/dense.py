@@ -42,10 +42,9 @@ _Read = TypeVar("_Read")
 
 _VOXEL_PX, _FINEST_PX = 3.0, 0.5  # of the image, at the median depth
 _TYPICAL_PX = 0.1  # deviation of a disparity, which bounds how far it is worth to look
-_SAMPLES = 6  # frames from which steps of disparity and the median depth are learnt
+_SAMPLES = 3  # frames from which the median depth is learnt
 _LENGTH = SHARED.index("baseline")
 _LEVEL = np.cos(np.deg2rad(2.5))
-_CUT_VOXELS = 2.0 * TRUNCATION_VOXELS  # deviation of a depth beyond which it is not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class DenseSettings:
             of a pixel is four voxels.
         cameras: 2 leaves the top camera out.
         every: of the frames that have a pose, every so many are used.
-        sigma_m: what is known less well to its neighbours is left out; None: 2.25 voxels.
+        sigma_m: what is known less well to its neighbours is left out; None: two voxels.
     """
 
     voxel_m: float | None = None
@@ -112,14 +111,11 @@ Measured: TypeAlias = Callable[[int], tuple[Depth, Float32, Image]]
 """Of a frame the depth, the deviation of its inverse in 1/m, and the reference image."""
 
 
-def _by_matching(
-    log: MeasurementLog, pictures: Pictures, samples: Sequence[int], cameras: int | None
-) -> tuple[Measured, Depth]:
-    """Depth by matching the images, whose steps are learnt from some frames, with their depths."""
+def _by_matching(log: MeasurementLog, pictures: Pictures, cameras: int | None) -> Measured:
+    """Depth by matching the images, the rig's correction taken off them."""
     corrections = [step.rig_correction for step in log if step.rig_correction is not None]
     matcher = DenseStereo(log.rig, cameras, corrections[-1] if corrections else None)
     product = np.float32(log.rig.fx * log.rig.baseline)
-    seen = matcher.learn_steps(_readable(lambda row: matcher.corrected(pictures(row)), samples))
 
     def measure(row: int) -> tuple[Depth, Float32, Image]:
         images = matcher.corrected(pictures(row))
@@ -128,7 +124,7 @@ def _by_matching(
         depth = np.where(known, product / np.where(known, disparity, np.float32(1.0)), 0.0)
         return depth.astype(np.float32), sigma / product, images[0]
 
-    return measure, product / seen
+    return measure
 
 
 def _by_camera(depths: Callable[[int], Depth], pictures: Pictures) -> Measured:
@@ -169,16 +165,15 @@ def fuse(
     if settings.cameras is not None and settings.cameras > rig.cameras:
         raise ConfigError(f"--cameras 3: the rig has {rig.cameras}; leave it out")
     used = list(range(0, len(rows), settings.every))
-    some = np.unique(np.linspace(0, len(used) - 1, _SAMPLES).astype(int))
-    samples = [rows[used[k]] for k in some]
     if depths is None:
-        measured, seen = _by_matching(log, pictures, samples, settings.cameras)
+        measured = _by_matching(log, pictures, settings.cameras)
         farthest = rig.fx * rig.baseline / MIN_DISPARITY_PX
         noise = _TYPICAL_PX / (rig.fx * rig.baseline)
     else:
         measured, farthest, noise = _by_camera(depths, pictures), np.inf, DEPTH_SIGMA_M
-        found = [depth[depth > 0.0] for depth, _, _ in _readable(measured, samples)]
-        seen = np.concatenate([np.empty(0, np.float32), *found])
+    some = np.unique(np.linspace(0, len(used) - 1, _SAMPLES).astype(int))
+    found = _readable(measured, [rows[used[k]] for k in some])
+    seen = np.concatenate([np.empty(0, np.float32), *(d[d > 0.0] for d, _, _ in found)])
     if not len(seen):
         raise DatasetError(
             "the images of this recording show no depth: no pair agrees anywhere; check the "
@@ -193,19 +188,17 @@ def fuse(
             "it out"
         )
     most = settings.range_m or min(farthest, float(np.sqrt(TRUNCATION_VOXELS * voxel / noise)))
-    fusion, scans = Fusion(rig.matrix, voxel), []
+    fusion, scans = Fusion(rig.matrix, voxel, most), []
     for done, k in enumerate(used):
         progress("fusing", done, len(used))
         try:
             depth, sigma, image = measured(rows[k])
         except FrameError:
             continue
-        sure = (depth < most) & (sigma * depth * depth < _CUT_VOXELS * voxel)
-        depth = np.where(sure, depth, np.float32(0.0))
+        wTc = estimate.trajectory.poses[k]
         shared = _shared(log, estimate.covariances[k], depth)
-        frame = DepthFrame(depth, sigma, image, estimate.trajectory.poses[k], shared)
-        fusion.add(frame)
-        scans.append((depth[::2, ::2].astype(np.float16), frame.wTc))
+        used_depth = fusion.add(DepthFrame(depth, sigma, image, wTc, shared))
+        scans.append((used_depth[::2, ::2].astype(np.float16), wTc))
     progress("fusing", len(used), len(used))
     kept = settings.sigma_m or KEPT_SIGMA_VOXELS * voxel
     surface = fusion.surface(kept)

@@ -33,7 +33,7 @@ class Wanted:
         max_range (--range METRES): farthest depth; default by the cameras' precision
         cameras: 2 leaves the top camera out
         every: of the frames every so many are matched densely
-        sigma (METRES): what is known less well is left out of --dense and --mesh; default 2.25
+        sigma (METRES): what is known less well is left out of --dense and --mesh; default two
             voxels
         recording: where the run's recording is now; default where it was, or next to the run
         overwrite: replace an earlier one

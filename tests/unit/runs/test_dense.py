@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from bags import PERIOD_NS, START_NS, camera_info, raw_image, write_bag
 from dataset_builders import CALIBRATION, HEIGHT, WIDTH, save, write_calibration
+from scipy.spatial import cKDTree
 from textured_wall import RIG, WALL_M, pictures
 
 import fgslam as fg
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import Float32, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.geometry import pose
-from fgslam.core.log import MeasurementLog
+from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.sensors import Increment, Observations
 from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory
 from fgslam.runs.bare import bare_experiment
@@ -158,6 +159,39 @@ def test_the_dense_map_of_a_session_from_its_frames_or_from_the_recording(tmp_pa
     assert result.dense_map(lost, every=1, voxel_m=0.05).frames == 1
     with pytest.raises(DatasetError, match="this recording has other times than the run"):
         result.dense_map(frames[1:])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("open3d")
+def test_a_person_who_walks_through_the_lab_leaves_no_trail() -> None:
+    lab, empty = (fg.open_recording(name).sequence for name in ("lab_person", "lab_loop"))
+    rig, poses, walked = lab.rig, lab.ground_truth.poses, list(range(20, 32, 2))
+    rows, columns = np.indices((rig.height, rig.width))
+    rays = np.stack([(columns - rig.cx) / rig.fx, (rows - rig.cy) / rig.fy, 0 * rows + 1.0], -1)
+    seen_of = []
+    for i in walked:
+        depth = lab.depth(i)
+        points = (rays * depth[..., None])[depth < empty.depth(i) - 0.3]
+        seen_of.append(points @ poses[i, :3, :3].T + poses[i, :3, 3])
+    person = cKDTree(np.concatenate(seen_of))
+
+    def surface(shown: ImageSequence, used: list[int]) -> Float32:
+        path = Trajectory(lab.timestamps[used], poses[used], "right")
+        settled = Estimate(path, np.zeros((len(used), 6, 6)), NO_LANDMARKS)
+        how = DenseSettings(0.04, every=1)
+        return fuse(
+            log_of(rig), settled, used, lambda i: shown.frame(i).images, settings=how
+        ).surface.positions
+
+    room = cKDTree(surface(empty, list(range(0, 120, 4))))
+
+    def trail(used: list[int]) -> int:
+        found = surface(lab, used)
+        return int(((person.query(found)[0] < 0.05) & (room.query(found)[0] > 0.15)).sum())
+
+    during, after = trail(walked), trail([*walked, *range(32, len(lab), 2)])
+    assert during > 100
+    assert after < 0.15 * during
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:
