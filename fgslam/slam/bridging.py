@@ -4,8 +4,8 @@ The prediction of such a frame is worth nothing once the frames after it are loc
 are free, and the estimators leave it where it was guessed. It is interpolated in time between the
 located frames around its gap, and so are frames located relative to each other only: along the
 screw motion from one to the other, bent towards the cubic (Hermite's) that begins and ends with the
-velocities there. By how much, and how uncertain that is, the drive shows: wherever as many frames
-in a row are located, the same is done with them and compared. So the weight of the cubic is found
+velocities there. By how much, and how uncertain that is, the drive shows: wherever it is located
+for as long, the same is done with its frames and compared. So the weight of the cubic is found
 by least squares (stacking: Breiman, Machine Learning 24, 1996), and the deviations are the errors
 left.
 """
@@ -18,7 +18,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, nearest_rows
 from fgslam.core.geometry import (
     adjoint,
     congruence,
@@ -109,13 +109,12 @@ def _bridged_parts(parts: MapParts) -> list[tuple[int, IntArray, Gap]]:
 def _between(gap: Gap, frame: int, drive: _Drive, covariances: FloatArray) -> PoseSigma:
     """Pose of a frame between the ends of its gap, and its covariance."""
     first, last = gap
-    compared = drive.compared_with(gap)
-    shift = frame - first
-    ways = [drive.way(start, start + shift, start + last - first) for start in compared]
-    true = drive.poses[compared + shift]
+    compared = drive.compared_with(gap, frame)
+    ways = [drive.way(*each) for each in compared.tolist()]
+    true = drive.poses[compared[:, 1]]
     weight = _weight(ways, true)
     errors = [_apart(way.pose(weight), pose) for way, pose in zip(ways, true, strict=True)]
-    lengths = [_apart(drive.poses[start], drive.poses[start + last - first]) for start in compared]
+    lengths = [_apart(drive.poses[start], drive.poses[end]) for start, _, end in compared]
     own = _apart(drive.poses[first], drive.poses[last])
     variance = _variance(own, np.reshape(errors, (-1, 2)), np.reshape(lengths, (-1, 2)))
     ends = [np.diagonal(covariances[k]).reshape(2, 3).max(axis=1) for k in gap]
@@ -150,12 +149,21 @@ class _Drive:
     poses: FloatArray
     known: BoolArray
 
-    def compared_with(self, gap: Gap) -> IntArray:
-        """(w,) where located frames begin, in a row as many as a gap with its ends; the nearest."""
-        count = gap[1] - gap[0] + 1
+    def compared_with(self, gap: Gap, frame: int) -> IntArray:
+        """(w, 3) begin, middle, end of located frames in a row as long as a gap; the nearest.
+
+        As long in time: a blind frame of a film that was thinned out may last for seconds.
+        """
+        since, times = self.times - self.times[gap[0]], self.times
+        ends = nearest_rows(times, times + since[gap[1]])
+        late = times + since[gap[1]] > times[-1] + 0.5 * (times[-1] - times[-2])
+        starts = np.arange(len(times))
+        middle = np.clip(nearest_rows(times, times + since[frame]), starts + 1, ends - 1)
         before = np.concatenate([[0], np.cumsum(self.known)])  # located frames before each
-        starts = np.flatnonzero(before[count:] - before[:-count] == count)
-        return starts[np.argsort(np.abs(starts - gap[0]), kind="stable")[:_STRETCHES]]
+        located = before[ends + 1] - before[starts] == ends - starts + 1
+        rows = np.flatnonzero(located & ~late & (middle > starts) & (middle < ends))
+        rows = rows[np.argsort(np.abs(rows - gap[0]), kind="stable")[:_STRETCHES]]
+        return np.column_stack([starts, middle, ends])[rows]
 
     def way(self, first: int, frame: int, last: int) -> _Way:
         """Where a frame lies between two located ones.

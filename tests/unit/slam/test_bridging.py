@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from fgslam.core import geometry as g
@@ -62,6 +64,20 @@ def test_the_deviations_are_those_of_the_errors() -> None:
         squared.append(error**2 / np.diagonal(found.covariances[12]))
     by_block = np.mean(squared, axis=0).reshape(2, 3).mean(axis=1)
     assert ((by_block > 0.6) & (by_block < 1.3)).all()
+
+
+def test_a_long_blind_frame_is_as_uncertain_as_long_segments_of_the_drive() -> None:
+    """To and fro in 16 s: in between lies one frame, at the far end, and both ends are as one."""
+    times = np.delete(np.arange(97.0), np.r_[33:40, 41:48])
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = 1.0 - np.cos(2.0 * np.pi * times / 16.0)
+    lost = int(np.flatnonzero(times == 40.0)[0])
+    parts = Parts([int(k == lost) for k in range(len(times))])
+    before = estimated(poses, parts)
+    timed = dataclasses.replace(before, trajectory=Trajectory(times, before.trajectory.poses))
+    found = bridged(timed, parts)
+    off = found.trajectory.poses[lost, 0, 3] - poses[lost, 0, 3]
+    assert 0.5 < abs(off) < 3.0 * np.sqrt(found.covariances[lost, 3, 3])
 
 
 def test_a_turn_that_was_measured_stays() -> None:
