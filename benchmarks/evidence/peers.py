@@ -122,6 +122,7 @@ def _spoilt(name: str, folder: str) -> Iterator[Course]:
     for stride, nth in ((2, "second"), (3, "third")):
         yield Course(f"{name}, each {nth} frame", folder, slice(None, None, stride))
     yield Course(f"{name}, gap of ten frames", folder, gap=range(20, 30))
+    yield Course(f"{name}, 5 % of the frames missing", folder, gap=range(7, 1000, 20))
     yield Course(f"{name}, half the size", folder, scale=0.5)
     for what, change in CHANGES.items():
         yield Course(f"{name}, {what}", folder, change=change)
@@ -221,7 +222,12 @@ def _fgslam(estimator: str) -> Program:
 
 def _other(method: str) -> Program:
     def run(folder: Path, truth: Trajectory) -> Outcome:
-        cpu = _spent(["-m", "benchmarks.evidence.peer", method, str(folder)])
+        try:
+            cpu = _spent(["-m", "benchmarks.evidence.peer", method, str(folder)])
+        except RuntimeError as error:  # as ORB-SLAM3 on small images
+            say(str(error))
+            nan = float("nan")
+            return Outcome(nan, nan, nan, 0, nan, nan, nan, 0.0)
         told = _loop(folder)
         live, scale = _error(folder / "live.tum", truth)
         end = np.nan
