@@ -41,6 +41,7 @@ _FROM = 16  # directions
 LOOKED_FOR = (4, 6, 9, 13, 19, 28, 42, 60)
 """Numbers of measurements of a landmark at which it is looked for; after the last, half stay."""
 _KNOWN = 8.0  # range over deviation from which a point is normally distributed, as of cameras' ones
+_SETTLED = 0.01  # squared deviations that a further step would go: a minimum, not where it ended
 _RIVAL = float(chi_square_quantile(0.999, 3))
 
 
@@ -213,9 +214,9 @@ def fixed_point(
 ) -> tuple[FloatArray, FloatArray] | None:
     """The world point (3,) that fits, given the last pose, and its covariance (3, 3).
 
-    None where it is open, or another one fits as well. Damped Gauss-Newton from starts in all
-    directions, on the models' own residuals, together with how far nuisance parameters are off;
-    noise contains the drift since each.
+    None where it is open, no minimum was reached, or another one fits as well. Damped Gauss-Newton
+    from starts in all directions, on the models' own residuals, together with how far nuisance
+    parameters are off; noise contains the drift since each.
     """
     groups, known = [], np.zeros((3, 3))
     for kind in {single.kind: None for single in singles}:
@@ -252,12 +253,14 @@ def fixed_point(
     starts[:, :3] = (np.array(_FROM_M)[:, None, None] * _directions()).reshape(-1, 3) + here
     with np.errstate(all="ignore"):
         found = _FIT.minimise(starts, lambda at, _: linear(at)[:2])
-        hessian, _, cost = linear(found)
+        hessian, gradient, cost = linear(found)
     cost[~np.isfinite(cost)] = np.inf
     best, points = int(np.argmin(cost)), found[:, :3]
     if not np.isfinite(cost[best]):
         return None
-    whole = hessian[best]
+    whole, slope = hessian[best], gradient[best]
+    if not slope @ np.linalg.solve(whole, slope) < _SETTLED:
+        return None
     own = whole[:3, :3] - whole[:3, 3:] @ np.linalg.solve(whole[3:, 3:], whole[3:, :3])
     information = np.linalg.eigvalsh(own)[0]
     distance = float(np.linalg.norm(points[best] - here))

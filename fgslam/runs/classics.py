@@ -46,7 +46,7 @@ from fgslam.slam.replay import replay
 GRAPH_KINDS = ("isam2", "batch")
 NO_GRAPH = "filters and windows keep no old pose on which an edge of a graph could close a loop"
 _ON_LANDMARKS = ("ekf", "landmark_kalman", "sliding_window")
-_BY_RANGE = ("odometry", "ekf", "landmark_kalman", "isam2", "batch")
+_BY_RANGE = ("odometry", "ekf", "landmark_kalman", "fixed_lag", "isam2", "batch")
 _TRACKED = ("landmark_kalman", "fixed_lag", "sliding_window", "isam2", "batch")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +218,26 @@ def test_covariances_state_the_errors(estimator: str, seeds: int, low: float, hi
         for world in (drive(("range_bearing",), seed, frames=20) for seed in range(seeds))
     ]
     assert low < np.mean(nees) < high
+
+
+@pytest.mark.slow
+def test_fixed_lag_states_its_errors_by_range_alone() -> None:
+    """Beacons are found over more frames than the lag has, and stay in it."""
+    worlds = [drive(("range",), seed, frames=40) for seed in range(50)]
+    nees = [world.nees(fg.replay(world.log, "fixed_lag").estimate) for world in worlds]
+    assert 0.8 < np.mean(nees) < 1.3
+    assert max(nees) < 4.0
+
+
+def test_a_beacon_is_found_only_where_the_search_reached_a_minimum() -> None:
+    """After 13 ranges of this one all 48 searches end on the way, 18 m off at best."""
+    log = MeasurementLog()
+    for one in drive(("range",), seed=10, frames=80).log.increments[:13]:
+        (ranges,) = one.measured
+        log.append(replace(one, measured=(ranges.select(ranges.ids == 0),)))
+    found = fg.replay(log, "ekf")
+    assert not found.failure
+    assert not len(found.estimate.landmarks)
 
 
 @pytest.mark.parametrize("measured", ["direction", "offset_range"])

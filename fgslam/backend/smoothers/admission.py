@@ -56,6 +56,7 @@ class Track:
         elsewhere: world positions and covariances of its rejected sightings since the last one
             that fitted.
         left_at: world position and covariance with which it last left a bounded lag.
+        stays: in a bounded lag, as no measurement of it fixes a point by itself.
     """
 
     least_parallax: float
@@ -65,6 +66,7 @@ class Track:
     sightings: int = 0
     elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     left_at: tuple[FloatArray, FloatArray] | None = None
+    stays: bool = False
 
     @property
     def by_camera(self) -> bool:
@@ -223,7 +225,9 @@ class LandmarkAdmission:
         """
         self.first_frame = frame
         left = [
-            (i, track) for i, track in self.by_last_sighting.items() if track.last.frame < frame
+            (i, track)
+            for i, track in self.by_last_sighting.items()
+            if track.last.frame < frame and not track.stays
         ]
         for identity, _ in left:
             del self.by_last_sighting[identity]

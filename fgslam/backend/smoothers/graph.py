@@ -26,7 +26,7 @@ from fgslam.backend.loops import (
     nearest_positive,
     refusal,
 )
-from fgslam.backend.measured import prior_of, sensor_in_pose
+from fgslam.backend.measured import RelativePoint, prior_of, sensor_in_pose
 from fgslam.backend.persistence import Persistence, StatedNoise
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
@@ -46,9 +46,11 @@ from fgslam.core.geometry import (
     adjoint,
     congruence,
     inverse,
+    point_pose_jacobian,
     reorthonormalise,
     se3_exp,
     se3_log,
+    transform_to_camera,
     transform_to_world,
 )
 from fgslam.core.sensors import (
@@ -122,6 +124,7 @@ class TrackedFrame:
         turn: what the bias of a gyroscope does to the motion.
         located: (6, 6) covariance with which it was found in the map without a prior; else None.
         measured: by other sensors than the camera.
+        covariance: (6, 6) of the pose, which the tracker's new landmarks contain.
     """
 
     frame: int
@@ -131,6 +134,7 @@ class TrackedFrame:
     turn: Turn | None = None
     located: FloatArray | None = None
     measured: tuple[Measured, ...] = ()
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(slots=True, eq=False)
@@ -495,8 +499,12 @@ class GraphBuilder:
             if track is None or not track.by_camera:
                 track = self.admission.sighted(identity, Sighting.by_others(frame))
                 if track.variable < 0:
-                    row = landmarks.rows(np.array([identity]))[0]
-                    self._enter(new, identity, landmarks.positions[row], tracked.wTc, np.inf)
+                    row = landmarks.rows(np.array([identity]))
+                    self._enter(new, identity, landmarks.positions[row[0]], tracked.wTc, np.inf)
+                    if not self._remember and self._waiting[identity][0][0] < frame:
+                        self._waiting[identity] = [(frame, self._found(tracked, landmarks, row))]
+                    kinds = {one.kind for _, one in self._waiting[identity]}
+                    track.stays = RelativePoint.kind in kinds
             if track.variable >= 0:
                 for seen, one in self._waiting.pop(identity):
                     if seen >= self.admission.first_frame:
@@ -505,6 +513,16 @@ class GraphBuilder:
         for model in (one.model for one in new.measured if one.model.nuisance.size):
             if model.kind not in self.measured:
                 new.values.insert(nuisance_key(model.kind), np.zeros(3))
+
+    def _found(self, tracked: TrackedFrame, landmarks: LandmarkMap, row: IntArray) -> Measured:
+        """Where the tracker has just found a landmark, for a lag that does not reach back so far.
+
+        One measurement in the frame's pose, which contains all by which it was found.
+        """
+        local = transform_to_camera(tracked.wTc, landmarks.positions[row])
+        turned = congruence(tracked.wTc[:3, :3].T, landmarks.covariances[row])
+        known = turned - congruence(point_pose_jacobian(local), tracked.covariance)
+        return RelativePoint(self._sensor.bTc).measured(local, known, landmarks.ids[row])
 
     def _sightings(
         self, frames: Sequence[int], variables: Sequence[int], measured: Sequence[Measured]

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.loops import Chain, Constraint, changes, constraint_factor, nearest_positive
+from fgslam.backend.measured import RelativePoint
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.admission import Track
@@ -85,6 +86,7 @@ class FixedLagSolver:
         self.window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
+        self._staying: list[int] = []  # landmark variables that no measurement fixes by itself
         self.poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self.remarks: list[str] = []
@@ -194,6 +196,8 @@ class FixedLagSolver:
         for one in new.measured:
             nuisance = self._tracker.nuisance(one.model.kind)
             self.window.measure(one.considering(*nuisance) if nuisance else one)
+            if one.model.kind == RelativePoint.kind:
+                self._staying += (one.points - landmark_key(0)).tolist()
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""
@@ -215,7 +219,7 @@ class FixedLagSolver:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
         self._oldest = max(self._oldest, len(self.poses) - 1 - self._lag)
         try:
-            self.window.let_go_before(self._oldest)
+            self.window.let_go_before(self._oldest, self._staying)
         except (UndeterminedError, np.linalg.LinAlgError) as error:
             raise self._failed(error) from None
         last_seen: dict[int, list[tuple[int, Track]]] = {}

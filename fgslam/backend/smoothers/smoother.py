@@ -170,7 +170,8 @@ class Smoother:
         frame, step = len(self.inputs) - 1, increment.odometry
         turn, measured = Turn.of((step,)), increment.measured
         held = self._held(accepted)
-        return TrackedFrame(frame, tracking.wTc, step, held, turn, measured=measured)
+        known = tracking.covariance
+        return TrackedFrame(frame, tracking.wTc, step, held, turn, None, measured, known)
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""

@@ -10,7 +10,7 @@ is linearised: judged where it has itself pulled the estimate to, a wrong match 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -820,8 +820,8 @@ class Window:
 
     # -- what leaves -------------------------------------------------------------------------
 
-    def let_go_before(self, first: int) -> Landmarks:
-        """Marginalises poses before a frame, and landmarks that only they saw.
+    def let_go_before(self, first: int, staying: Sequence[int] = ()) -> Landmarks:
+        """Marginalises poses before a frame, and landmarks that only they saw, but some variables.
 
         Returns:
             The latter, with what was known of them given the poses.
@@ -839,7 +839,7 @@ class Window:
         self.factors = untouched
         self._keep(lambda one: one.poses >= first)
         self._drop_poses(leaving)
-        left = np.concatenate([one.points for one in self._every])
+        left = np.concatenate([*(one.points for one in self._every), np.array(staying, np.int64)])
         return self._eliminate(~np.isin(self.landmarks.variables, left))
 
     def _keep(self, which: Callable[[Sightings], BoolArray]) -> None:
