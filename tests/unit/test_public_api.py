@@ -121,7 +121,8 @@ def names_of(module: str) -> dict[str, Any]:
 
 def types_in(annotation: Any, module: str) -> set[Any]:
     """Classes of the package in an annotation."""
-    waiting = [names_of(module).get(name) for name in re.findall(r"(?<![\w.])\w+(?![\w.])", str(annotation))]
+    names = re.findall(r"(?<![\w.])\w+(?![\w.])", str(annotation))
+    waiting = [names_of(module).get(name) for name in names]
     found = set()
     while waiting:
         one = waiting.pop()
