@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from benchmarks.curves import IMAGES, PICTURES
 from benchmarks.measured import stored
 from benchmarks.rows import RESULTS, Record, Row, Section, load_record, shown_bound, shown_number
 from benchmarks.tables import Cell, Table, grid, shown
@@ -33,10 +34,12 @@ SUBJECTS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 def write_pages(results: Path = RESULTS, folder: Path = PAGES) -> None:
-    """Writes one page a subject, the overview, and the numbers in README."""
+    """Writes one page a subject, the overview, its pictures, and the numbers in README."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in all_pages(results).items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
+    for name, draw in PICTURES.items():
+        draw(IMAGES / name)
     README.write_text(readme(README.read_text(encoding="utf-8")), encoding="utf-8")
 
 
@@ -156,6 +159,8 @@ def _section(section: Section) -> Iterator[str]:
         yield from (*_wrapped(paragraph), "")
     if section.commands:
         yield from ("```sh", *_continued(section.commands), "```", "")
+    for name, shows in section.pictures.items():
+        yield from (f"![{shows}](../images/{name})", "")
     mixed = any(section.sources)
     if section.rows:
         yield from (*_bounds(section.rows, mixed), "")

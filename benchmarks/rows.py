@@ -70,6 +70,7 @@ class Section:
         text: paragraphs: what is measured, and what limits it.
         rows: numbers with bounds.
         tables: numbers without.
+        pictures: of :data:`benchmarks.curves.PICTURES`, each with what it shows.
     """
 
     title: str
@@ -77,6 +78,7 @@ class Section:
     text: tuple[str, ...] = ()
     rows: tuple[Row, ...] = ()
     tables: tuple[Table, ...] = ()
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """From one filter a landmark to everything at once: accuracy against cost on four drives.
 
 Strasdat, Montiel and Davison (2012) ask when a filter is worth its time. Each estimator replays the
-same measurements in a process of its own, on one thread.
+same measurements in a process of its own, on one thread; :mod:`benchmarks.curves` draws them.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ from __future__ import annotations
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.runs import EXPERIMENTS, experiment, say
 from benchmarks.tables import Cell, Table
 from fgslam.backend.settings import EstimatorSettings, FastSlamSettings
 from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.statistics import value_at
 from fgslam.runs.compare import all_kinds
@@ -35,11 +37,13 @@ STEPS = (
     "batch",
 )  # fmt: skip
 PARTICLES = (1, 3, 10, 30, 100, 300)
+EVERY = (16, 8, 4, 2, 1)
+"""One landmark in so many is kept: what an estimator gains by its time (Strasdat et al. 3)."""
 _RUNS = EXPERIMENTS.parent / "build" / "staircase"  # kept; to measure the drives again, remove it
 
 
 def tables(data: Path) -> list[Table]:
-    """A table a drive, and one over the number of particles."""
+    """A table a drive, one over the number of particles, and one over that of landmarks."""
     found = []
     for name, what in DRIVES.items():
         if not (_RUNS / name / "metrics.json").is_file():
@@ -49,7 +53,14 @@ def tables(data: Path) -> list[Table]:
         found.append(Table(what, ("estimator", *_COLUMNS), rows))
     over = [_row("lab_trials", n, FastSlamSettings(particles=n)) for n in PARTICLES]
     over.append(_row("lab_trials", "`batch`", all_kinds()["batch"]))
-    return [*found, Table("particles", ("particles", *_COLUMNS), over)]
+    found.append(Table("particles", ("particles", *_COLUMNS), over))
+    fewer = [
+        (kind, *_row("lab_trials", every, all_kinds()[kind], every))
+        for kind in STEPS
+        if kind != "fast_slam"  # its curve is that over particles
+        for every in EVERY
+    ]
+    return [*found, Table("landmarks", ("estimator", "one in", *_COLUMNS), fewer)]
 
 
 _COLUMNS = (
@@ -58,16 +69,27 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def _row(name: str, first: Cell, settings: EstimatorSettings) -> tuple[Cell, ...]:
-    say(f"replaying {name}: {first}")
+def _row(name: str, first: Cell, settings: EstimatorSettings, every: int = 1) -> tuple[Cell, ...]:
+    say(f"replaying {name}: {settings.kind}, {first}")
     apart = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=apart) as executor:
-        return (first, *executor.submit(_replayed, name, settings).result())
+        return (first, *executor.submit(_replayed, name, settings, every).result())
 
 
-def _replayed(name: str, settings: EstimatorSettings) -> tuple[Cell, ...]:
+def thinned(one: Increment, every: int) -> Increment:
+    """A frame with one landmark in so many, by their identities."""
+    kept = one.observations.ids % every == 0
+    missed, pruned = (ids[ids % every == 0] for ids in (one.missed_ids, one.pruned_ids))
+    seen = one.observations.select(kept)
+    return replace(
+        one, observations=seen, rejected=one.rejected[kept], missed_ids=missed, pruned_ids=pruned
+    )
+
+
+def _replayed(name: str, settings: EstimatorSettings, every: int) -> tuple[Cell, ...]:
     run = _RUNS / name
     log = MeasurementLog.load(run / LOG_FILE)
+    log = replace(log, increments=[thinned(one, every) for one in log])
     began = time.process_time()
     played = replay(log, settings, experiment(name).frontend.ego_motion)
     spent = time.process_time() - began

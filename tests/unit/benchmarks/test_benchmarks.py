@@ -6,11 +6,13 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import benchmarks.__main__ as runner
 from benchmarks.__main__ import EVIDENCE
+from benchmarks.curves import IMAGES, PICTURES
 from benchmarks.measured import keep, stored
 from benchmarks.pages import PAGES, README, SUBJECTS, WIDTH, all_pages, fitted, page, readme
 from benchmarks.rows import (
@@ -114,6 +116,16 @@ def test_pages_of_results_are_those_of_the_committed_measurements() -> None:
         name for _, names in SUBJECTS.values() for name in names
     }
     assert {path.stem for path in PAGES.glob("*.md")} == set(all_pages())
+
+
+@pytest.mark.parametrize("name", sorted(PICTURES))
+def test_pictures_of_results_are_those_of_the_stored_measurements(
+    name: str, tmp_path: Path
+) -> None:
+    PICTURES[name](tmp_path / name)
+    now, kept = (cv2.imread(str(folder / name)) for folder in (tmp_path, IMAGES))
+    assert now.shape == kept.shape, f"stale {name}: run python -m benchmarks pages"
+    assert (np.abs(now.astype(int) - kept) > 32).mean() < 1e-4, f"stale picture {name}"
 
 
 def test_numbers_in_readme_are_those_of_the_stored_measurements() -> None:
