@@ -30,6 +30,8 @@ class Direction(fg.LandmarkModel):
 #
 # A frame is its time, the odometry since the last one, and what was measured. The beacons are told
 # apart by numbers. (With cameras, `Slam.log` is such a log already, and landmarks share numbers.)
+# Where the robot and its beacons lie in a plane, heights are measured, too: 0, with a variance; of
+# the six degrees of freedom three never err then, and a NEES of 0.5 is right.
 
 # %%
 rng = np.random.default_rng(1)

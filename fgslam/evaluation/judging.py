@@ -489,8 +489,8 @@ def require_named(
         )
     if not isinstance(truth, Trajectory | None):
         raise ConfigError(
-            f"the truth is a {type(truth).__name__}; give a trajectory: "
-            "fgslam.Trajectory.load(file)"
+            f"the truth is a {type(truth).__name__}; give fgslam.Trajectory.load(file), or "
+            "fgslam.Trajectory(times, poses) of arrays (n,) and (n, 4, 4)"
         )
     if truth is not None and truth.frame != "right" and not isinstance(rig, CameraRig):
         raise ConfigError(

@@ -54,27 +54,35 @@ class MeasurementModel:
         """What a frame measured.
 
         Args:
-            values: (k, m).
-            covariance: (m, m) of each, or (k, m, m).
+            values: (k, m), or the k m numbers in a row.
+            covariance: (m, m) of each, or (k, m, m); a variance where m is 1.
             ids: (k,) identities of the landmarks; none for a model of poses.
 
         Raises:
             MeasurementLogError: the shapes do not fit, a number is not finite, or a covariance is
                 not positive definite.
         """
-        given, m = np.atleast_2d(np.asarray(values, np.float64)), self.size
-        k, noise = len(given), np.asarray(covariance, np.float64)
-        wanted, most = (0, 0) if isinstance(self, PoseModel) else (k, 3)
+        given, m = np.atleast_1d(np.asarray(values, np.float64)), self.size
+        if given.ndim == 1 and given.size % m == 0:
+            given = given.reshape(-1, m)
+        k, noise = len(given), np.atleast_2d(np.asarray(covariance, np.float64))
+        of_pose = isinstance(self, PoseModel)
+        wanted, most = (0, 0) if of_pose else (k, 3)
         if len(self.nuisance) > most:
             raise MeasurementLogError(
                 f"{self.kind}: {len(self.nuisance)} nuisance parameters; give at most {most}"
             )
-        if len(np.unique(ids)) != wanted or np.size(ids) != wanted:
-            raise MeasurementLogError(f"{self.kind}: give {wanted} different ids for {k} values")
         if given.shape != (k, m) or noise.shape not in ((m, m), (k, m, m)):
             raise MeasurementLogError(
                 f"{self.kind}: values {given.shape} with covariance {noise.shape}; give (k, {m}) "
                 f"and ({m}, {m}) or (k, {m}, {m})"
+            )
+        if len(np.unique(ids)) != wanted or np.size(ids) != wanted:
+            raise MeasurementLogError(f"{self.kind}: give {wanted} different ids for {k} values")
+        shape = np.shape(self.predict(np.eye(4)[None] if of_pose else np.ones((1, 3))))
+        if shape != (1, m):
+            raise MeasurementLogError(
+                f"{self.kind}: predict() of k = 1 returned an array {shape}; return (k, {m})"
             )
         if not np.isfinite(given).all() or not (np.linalg.eigvalsh(noise) > 0.0).all():
             raise MeasurementLogError(

@@ -288,6 +288,22 @@ def test_measurements_that_cannot_be_are_refused(
         Direction().measured(values, covariance, ids)
 
 
+def test_a_flat_array_is_that_of_single_numbers() -> None:
+    flat = MODELS["range"].measured([1.0, 2.0], 0.01, ids=[3, 4])
+    assert (flat.values.shape, flat.covariance.shape) == ((2, 1), (2, 1, 1))
+    with pytest.raises(MeasurementLogError, match=r"values \(3,\) .* give \(k, 2\)"):
+        Direction().measured([1.0, 2.0, 3.0], np.eye(2), ids=[3])
+
+
+def test_a_prediction_of_the_wrong_shape_is_refused_where_it_is_measured() -> None:
+    class Flat(Range):
+        def predict(self, x: FloatArray) -> FloatArray:
+            return np.asarray(super().predict(x)[:, 0])
+
+    with pytest.raises(MeasurementLogError, match=r"returned an array \(1,\); return \(k, 1\)"):
+        Flat().measured([[1.0]], [[0.01]], ids=[3])
+
+
 def test_nuisance_parameters_are_few_and_of_landmarks() -> None:
     offset = Position()
     offset.nuisance = np.eye(1)

@@ -499,10 +499,10 @@ class GraphBuilder:
             if track is None or not track.by_camera:
                 track = self.admission.sighted(identity, Sighting.by_others(frame))
                 if track.variable < 0:
-                    row = landmarks.rows(np.array([identity]))
-                    self._enter(new, identity, landmarks.positions[row[0]], tracked.wTc, np.inf)
+                    at = landmarks.rows(np.array([identity]))
+                    self._enter(new, identity, landmarks.positions[at[0]], tracked.wTc, np.inf)
                     if not self._remember and self._waiting[identity][0][0] < frame:
-                        self._waiting[identity] = [(frame, self._found(tracked, landmarks, row))]
+                        self._waiting[identity] = [(frame, self._found(tracked, landmarks, at))]
                     kinds = {one.kind for _, one in self._waiting[identity]}
                     track.stays = RelativePoint.kind in kinds
             if track.variable >= 0:
