@@ -351,11 +351,12 @@ def classics(
 
     victoria_park, sphere2500, city10000, w10000 by iSAM2 and at once: filters and windows keep no
     old pose on which an edge could close a loop; victoria_park, which has no such edge, by three of
-    them, too; kitti00, stereo tracks, by five. ATE and NEES where truth is known, chi-square, CPU
-    of a step. All of them take some minutes.
+    them, too; kitti00, stereo tracks, by five; plaza1 and plaza2, ranges, and robots of UTIAS
+    MRCLAM by six. ATE and NEES where truth is known, chi-square, CPU of a step. All of them take
+    some minutes.
 
     Args:
-        names (NAME...): which, or graphs, .g2o; default all
+        names (NAME...): which, or graphs, .g2o, or Robot1_Measurement.dat of UTIAS; default all
         steps: only so many steps of each drive
     """
     from fgslam.runs.classics import CLASSICS

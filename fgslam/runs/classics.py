@@ -1,7 +1,7 @@
 """`fgslam classics`: well-known data sets, out of the installed GTSAM, through estimators.
 
-Nothing is downloaded. Graphs, in files of g2o too, are solved by iSAM2 and at once; stereo tracks
-are replayed.
+Nothing is downloaded; UTIAS MRCLAM is read where it lies. Graphs, in files of g2o too, are solved
+by iSAM2 and at once; stereo tracks are replayed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fgslam.backend.step_graph import (
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.geometry import pose, so3_exp, wrap
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.types import Trajectory
@@ -37,6 +37,7 @@ from fgslam.datasets.settings import (
 )
 from fgslam.datasets.times import read_table
 from fgslam.evaluation.judging import Truth, judge_answer, judge_replay, lone_answer
+from fgslam.factors.models import RangeBearing
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.compare import all_kinds
@@ -107,15 +108,68 @@ def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
     at = np.column_stack([np.interp(ranges[:, 0], seconds, one) for one in course])
     log, ends = MeasurementLog(), np.searchsorted(steps[:, 0], ranges[:, 0], "right")
     for k, (stamp, _, radio, distance) in enumerate(ranges):
-        motion = np.eye(4)
-        for _, ahead, turn in steps[ends[k - 1] if k else 0 : ends[k]]:
-            motion = motion @ _in_plane(ahead, 0.0, turn)
-        noise = pose_noise(motion, RecordedOdometrySettings())
-        noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
+        step = _wheels(steps[ends[k - 1] : ends[k], 1:]) if k else None
         seen = range_in_plane(distance, _RANGE_SIGMA_M, int(radio))
-        log.append(Increment.of(k, stamp, Odometry(motion, noise) if k else None, seen))
+        log.append(Increment.of(k, stamp, step, seen))
     return log, Trajectory(ranges[:, 0], np.array([_in_plane(*one) for one in at]))
 
+
+def _wheels(steps: FloatArray) -> Odometry:
+    """Ways ahead and turns (k, 2), one after the other, in the plane."""
+    motion = np.eye(4)
+    for ahead, turn in steps:
+        motion = motion @ _in_plane(ahead, 0.0, turn)
+    noise = pose_noise(motion, RecordedOdometrySettings())
+    noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
+    return Odometry(motion, noise)
+
+
+def _barcodes(path: Path) -> tuple[MeasurementLog, Trajectory]:
+    """A robot's ranges and bearings of barcodes (UTIAS MRCLAM, Leung and others 2011), and truth.
+
+    Their deviations, which no file states, are those against the truth, by the median.
+    """
+    robot = path.name.removesuffix(_MRCLAM)
+
+    def rows(name: str, *columns: str) -> FloatArray:
+        return read_table(path.parent / name, columns).values
+
+    subjects = {code: one for one, code in rows("Barcodes.dat", "subject", "barcode").tolist()}
+    known = rows("Landmark_Groundtruth.dat", "subject", "x", "y")
+    places = {one: (x, y) for one, x, y in known.tolist()}
+    speeds = rows(f"{robot}_Odometry.dat", "time", "velocity", "turn rate")
+    seconds, *course = rows(f"{robot}_Groundtruth.dat", "time", "x", "y", "heading").T
+    seen = rows(path.name, "time", "barcode", "range", "bearing")
+    seen[:, 1] = [subjects.get(code, -1.0) for code in seen[:, 1].tolist()]  # robots have some, too
+    begin, end = max(seconds[0], speeds[0, 0]), min(seconds[-1], speeds[-1, 0])
+    within = (begin <= seen[:, 0]) & (seen[:, 0] <= end)
+    seen = np.unique(seen[within & np.isin(seen[:, 1], list(places))], axis=0)
+    if not len(seen):
+        raise DatasetError(f"{path}: sees no landmark while the truth lasts; give ROBOT{_MRCLAM}")
+    stamps, frames = np.unique(seen[:, 0], return_inverse=True)
+    course[2] = np.unwrap(course[2])
+    at = np.column_stack([np.interp(stamps, seconds, one) for one in course])
+    x, y = (np.array([places[one] for one in seen[:, 1]]) - at[frames, :2]).T
+    off = seen[:, 2:] - np.column_stack([np.hypot(x, y), np.arctan2(y, x) - at[frames, 2]])
+    off[:, 1] = wrap(off[:, 1])
+    variances = (_OF_MEDIAN * np.median(np.abs(off), axis=0)) ** 2
+    log, model, noise = MeasurementLog(), RangeBearing(), np.diag([*variances, _STIFF])
+    for k, stamp in enumerate(stamps.tolist()):
+        own = seen[frames == k]
+        own = own[np.unique(own[:, 1], return_index=True)[1]]
+        values = np.column_stack([own[:, 2:], np.zeros(len(own))])
+        measured = [model.measured(values, noise, own[:, 1].astype(np.int64))]
+        step = None
+        if k:
+            first, last = np.searchsorted(speeds[:, 0], [stamps[k - 1], stamp], "right")
+            bounds = np.array([stamps[k - 1], *speeds[first:last, 0], stamp])
+            step = _wheels(speeds[first - 1 : last, 1:] * np.diff(bounds)[:, None])
+        log.append(Increment.of(k, stamp, step, measured))
+    return log, Trajectory(stamps, np.array([_in_plane(*one) for one in at]))
+
+
+_MRCLAM = "_Measurement.dat"  # of a robot, by which it is named
+_OF_MEDIAN = 1.4826  # deviation over the median size of normally distributed errors
 
 _RANGE_SIGMA_M = 0.5  # against the truth, once scaled: white
 _HEADING = {"plaza1": 0.0, "plaza2": np.pi}  # of the course against what the file calls heading
@@ -135,7 +189,10 @@ def require_classics(names: Sequence[str]) -> None:
     """Raises ConfigError for a name that is neither a classic nor a file."""
     for name in names:
         if name not in CLASSICS and not Path(name).is_file():
-            raise ConfigError(f"no classic {name!r}; give {', '.join(CLASSICS)}, or a .g2o file")
+            raise ConfigError(
+                f"no classic {name!r}; give {', '.join(CLASSICS)}, a .g2o file, or "
+                f"Robot1{_MRCLAM} of UTIAS MRCLAM"
+            )
 
 
 def run_classic(
@@ -144,7 +201,8 @@ def run_classic(
     """Every estimator that fits, one after the other.
 
     Args:
-        name: of :data:`CLASSICS`, or the path of a graph: `.g2o`, `.graph`.
+        name: of :data:`CLASSICS`, or the path of a graph: `.g2o`, `.graph`, or of a robot of UTIAS
+            MRCLAM: `Robot1_Measurement.dat`, next to the other files of its folder.
         steps: only so many steps of the drive.
         kinds: which solvers of a graph.
 
@@ -154,10 +212,11 @@ def run_classic(
     if name == "kitti00":
         yield from _tracks(name, steps)
         return
-    if name in _HEADING:
-        log, mower = _ranges(name)
+    if name in _HEADING or name.endswith(_MRCLAM):
+        log, where = _ranges(name) if name in _HEADING else _barcodes(Path(name))
         log = MeasurementLog(increments=log.increments[:steps])
-        yield from _replayed(name, log, mower, len(log), _BY_RANGE)
+        count = sum(len(one.measured[0]) for one in log)
+        yield from _replayed(Path(name).name, log, where, count, _BY_RANGE)
         return
     file, make_truth = _GRAPHS.get(name, (name, None))
     graph = read_graph(_data(file) if name in _GRAPHS else Path(file)).first(steps)

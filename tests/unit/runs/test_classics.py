@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.runs.classics import (
     CLASSICS,
     classics_notes,
@@ -39,6 +42,54 @@ def test_ranges_that_are_scaled_locate_a_mower() -> None:
     assert rows["odometry"].ate_m > 1.5
     for kind in ("ekf", "fixed_lag", "isam2", "batch"):
         assert rows[kind].ate_m < 0.6
+
+
+def write_barcodes(folder: Path, rng: np.random.Generator) -> Path:
+    """A folder of UTIAS MRCLAM: one robot, twice round among eight landmarks, and another robot."""
+    corners = 4.0 * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y])
+    speed, turn, end = 0.4, 0.2, 60.0
+    times = 1.288e9 + np.arange(0.0, end, 0.05)
+    heading = turn * (times - times[0])
+    x, y = speed / turn * np.sin(heading), speed / turn * (1.0 - np.cos(heading))
+    course = np.column_stack([times, x, y, (heading + np.pi) % (2.0 * np.pi) - np.pi])
+    noisy = np.array([speed, turn]) + 0.06 * rng.standard_normal((len(times), 2))
+    seen = []
+    for k in range(3, len(times), 10):
+        for code, place in [*zip(range(60, 68), corners, strict=True), (5, np.zeros(2))]:
+            ahead, left = place - course[k, 1:3]
+            bearing = np.arctan2(left, ahead) - heading[k]
+            if np.cos(bearing) > 0.0:
+                spread = rng.normal(size=2) * [0.05, 0.02]
+                seen.append((times[k] + 0.01, code, np.hypot(ahead, left), bearing))
+                seen[-1] = (*seen[-1][:2], *(seen[-1][2:] + spread))
+    codes = [(1, 5), *zip(range(6, 14), range(60, 68), strict=True)]
+    truth = np.column_stack([np.arange(6, 14), corners, np.full((8, 2), 1e-4)])
+    tables = {
+        "Barcodes": codes, "Landmark_Groundtruth": truth, "Robot2_Groundtruth": course,
+        "Robot2_Odometry": np.column_stack([times, noisy]), "Robot2_Measurement": seen,
+    }  # fmt: skip
+    for name, rows in tables.items():
+        np.savetxt(folder / f"{name}.dat", rows, fmt="%.4f", header="as published")
+    return folder / "Robot2_Measurement.dat"
+
+
+def test_barcodes_of_utias_locate_a_robot(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write_barcodes(tmp_path, rng)
+    require_classics([str(path)])
+    rows = {one.estimator: one for one in run_classic(str(path), 30)}
+    assert not any(one.why for one in rows.values())
+    assert rows["batch"].poses == 30
+    assert rows["batch"].classic == "Robot2_Measurement.dat"
+    for kind in ("ekf", "batch"):
+        assert rows[kind].ate_m < 0.85 * rows["odometry"].ate_m
+        assert rows[kind].nees < 4.0
+
+
+def test_barcodes_without_a_landmark_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = write_barcodes(tmp_path, rng)
+    path.write_text("1288000001.0 5 2.0 0.1\n")  # another robot
+    with pytest.raises(DatasetError, match="sees no landmark while the truth lasts"):
+        next(run_classic(str(path)))
 
 
 def test_a_solver_that_is_not_asked_for_does_not_solve() -> None:
