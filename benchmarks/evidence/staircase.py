@@ -9,18 +9,17 @@ from __future__ import annotations
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.runs import EXPERIMENTS, experiment, say
 from benchmarks.tables import Cell, Table
 from fgslam.backend.settings import EstimatorSettings, FastSlamSettings
 from fgslam.core.log import MeasurementLog
-from fgslam.core.sensors import Increment
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.statistics import value_at
 from fgslam.runs.compare import all_kinds
 from fgslam.runs.folder import LOG_FILE
+from fgslam.runs.judge import part_of
 from fgslam.runs.run import run_experiment
 from fgslam.runs.slam_comparison import load_truth
 from fgslam.slam.replay import replay
@@ -76,20 +75,10 @@ def _row(name: str, first: Cell, settings: EstimatorSettings, every: int = 1) ->
         return (first, *executor.submit(_replayed, name, settings, every).result())
 
 
-def thinned(one: Increment, every: int) -> Increment:
-    """A frame with one landmark in so many, by their identities."""
-    kept = one.observations.ids % every == 0
-    missed, pruned = (ids[ids % every == 0] for ids in (one.missed_ids, one.pruned_ids))
-    seen = one.observations.select(kept)
-    return replace(
-        one, observations=seen, rejected=one.rejected[kept], missed_ids=missed, pruned_ids=pruned
-    )
-
-
 def _replayed(name: str, settings: EstimatorSettings, every: int) -> tuple[Cell, ...]:
     run = _RUNS / name
     log = MeasurementLog.load(run / LOG_FILE)
-    log = replace(log, increments=[thinned(one, every) for one in log])
+    log = part_of(log, 0, every)
     began = time.process_time()
     played = replay(log, settings, experiment(name).frontend.ego_motion)
     spent = time.process_time() - began

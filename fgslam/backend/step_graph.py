@@ -13,6 +13,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
@@ -174,7 +175,7 @@ def log_of(graph: StepGraph) -> MeasurementLog:
     Raises:
         DatasetError: an edge closes a loop, which a log does not hold, or the graph is in space.
     """
-    log, model = MeasurementLog(), RangeBearing()
+    log = MeasurementLog()
     motion, noise, before = np.eye(4), np.zeros((6, 6)), _first(graph)
     for key, factors in {before: [], **graph.steps}.items():
         seen = [one for one in factors if max(one.keys()) >= _LANDMARK]
@@ -187,17 +188,23 @@ def log_of(graph: StepGraph) -> MeasurementLog:
             motion, noise = motion @ step, compose_covariance(step, noise, added)
         if seen or not len(log):
             found = [one.measured() for one in seen]
-            values = np.array([(z.range(), z.bearing().theta(), 0.0) for z in found]).reshape(-1, 3)
-            bearing, distance = (
-                np.array([one.noiseModel().sigmas() for one in seen]).reshape(-1, 2).T
-            )
-            spread = np.column_stack([distance**2, bearing**2, np.full(len(seen), _STIFF)])
+            values = [(z.range(), z.bearing().theta()) for z in found]
+            sigmas = [one.noiseModel().sigmas()[::-1] for one in seen]
             ids = [max(one.keys()) % _LANDMARK for one in seen]
-            measured = [model.measured(values, spread[:, :, None] * np.eye(3), ids)] if seen else []
+            measured = [seen_in_plane(values, sigmas, ids)] if seen else []
             odometry = Odometry(motion, noise) if len(log) else None
             log.append(Increment.of(key, float(key), odometry, measured))
             motion, noise = np.eye(4), np.zeros((6, 6))
     return log
+
+
+def seen_in_plane(
+    values: npt.ArrayLike, sigmas: npt.ArrayLike, landmarks: npt.ArrayLike
+) -> Measured:
+    """Ranges and bearings (k, 2) of landmarks as high as the sensor; their deviations alike."""
+    whole = np.insert(values, 2, 0.0, axis=1)
+    spread = np.insert(np.square(sigmas), 2, _STIFF, axis=1)
+    return RangeBearing().measured(whole, spread[:, :, None] * np.eye(3), landmarks)
 
 
 def range_in_plane(distance_m: float, sigma_m: float, landmark: int) -> tuple[Measured, Measured]:

@@ -19,12 +19,13 @@ from fgslam.backend.step_graph import (
     motions_chained,
     range_in_plane,
     read_graph,
+    seen_in_plane,
     solve_at_once,
     solve_by_steps,
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.geometry import pose, so3_exp, wrap
+from fgslam.core.geometry import inverse, pose, so3_exp, wrap
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.types import Trajectory
@@ -37,7 +38,6 @@ from fgslam.datasets.settings import (
 )
 from fgslam.datasets.times import read_table
 from fgslam.evaluation.judging import Truth, judge_answer, judge_replay, lone_answer
-from fgslam.factors.models import RangeBearing
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.compare import all_kinds
@@ -97,6 +97,18 @@ def _in_plane(x: float, y: float, turn: float) -> FloatArray:
     return pose(so3_exp(np.array([0.0, 0.0, turn])), np.array([x, y, 0.0]))
 
 
+def _poses_at(stamps: FloatArray, times: FloatArray, course: Sequence[FloatArray]) -> FloatArray:
+    """Poses (n, 4, 4) at some times, of a course (x, y, turn) that is known at others."""
+    at = np.column_stack([np.interp(stamps, times, one) for one in course])
+    return np.array([_in_plane(*one) for one in at])
+
+
+def _by_wheels(motion: FloatArray) -> Odometry:
+    noise = pose_noise(motion, RecordedOdometrySettings())
+    noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
+    return Odometry(motion, noise)
+
+
 def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
     """A mower's ranges to radios (Djugash and others 2009), a frame each, and where it was."""
     from scipy.io import loadmat
@@ -105,23 +117,14 @@ def _ranges(name: str) -> tuple[MeasurementLog, Trajectory]:
     steps, (seconds, *course) = file["DR"], file["GT"].T
     ranges = file["TD"][np.unique(file["TD"][:, 0], return_index=True)[1]]  # some are out of order
     course[2] = np.unwrap(course[2]) + _HEADING[name]
-    at = np.column_stack([np.interp(ranges[:, 0], seconds, one) for one in course])
     log, ends = MeasurementLog(), np.searchsorted(steps[:, 0], ranges[:, 0], "right")
     for k, (stamp, _, radio, distance) in enumerate(ranges):
-        step = _wheels(steps[ends[k - 1] : ends[k], 1:]) if k else None
+        motion = np.eye(4)
+        for _, ahead, turn in steps[ends[k - 1] if k else 0 : ends[k]]:
+            motion = motion @ _in_plane(ahead, 0.0, turn)
         seen = range_in_plane(distance, _RANGE_SIGMA_M, int(radio))
-        log.append(Increment.of(k, stamp, step, seen))
-    return log, Trajectory(ranges[:, 0], np.array([_in_plane(*one) for one in at]))
-
-
-def _wheels(steps: FloatArray) -> Odometry:
-    """Ways ahead and turns (k, 2), one after the other, in the plane."""
-    motion = np.eye(4)
-    for ahead, turn in steps:
-        motion = motion @ _in_plane(ahead, 0.0, turn)
-    noise = pose_noise(motion, RecordedOdometrySettings())
-    noise[_OUT_OF_PLANE, _OUT_OF_PLANE] = _STIFF
-    return Odometry(motion, noise)
+        log.append(Increment.of(k, stamp, _by_wheels(motion) if k else None, seen))
+    return log, Trajectory(ranges[:, 0], _poses_at(ranges[:, 0], seconds, course))
 
 
 def _barcodes(path: Path) -> tuple[MeasurementLog, Trajectory]:
@@ -135,37 +138,35 @@ def _barcodes(path: Path) -> tuple[MeasurementLog, Trajectory]:
         return read_table(path.parent / name, columns).values
 
     subjects = {code: one for one, code in rows("Barcodes.dat", "subject", "barcode").tolist()}
-    known = rows("Landmark_Groundtruth.dat", "subject", "x", "y")
-    places = {one: (x, y) for one, x, y in known.tolist()}
-    speeds = rows(f"{robot}_Odometry.dat", "time", "velocity", "turn rate")
+    known = rows("Landmark_Groundtruth.dat", "subject", "x", "y").tolist()
+    places = {subject: (x, y, 0.0, 1.0) for subject, x, y in known}
+    times, speed, rate = rows(f"{robot}_Odometry.dat", "time", "velocity", "turn rate").T
     seconds, *course = rows(f"{robot}_Groundtruth.dat", "time", "x", "y", "heading").T
     seen = rows(path.name, "time", "barcode", "range", "bearing")
     seen[:, 1] = [subjects.get(code, -1.0) for code in seen[:, 1].tolist()]  # robots have some, too
-    begin, end = max(seconds[0], speeds[0, 0]), min(seconds[-1], speeds[-1, 0])
-    within = (begin <= seen[:, 0]) & (seen[:, 0] <= end)
-    seen = np.unique(seen[within & np.isin(seen[:, 1], list(places))], axis=0)
+    late, early = (seen[:, 0] < min(seconds[-1], times[-1])), seen[:, 0] > max(seconds[0], times[0])
+    seen = seen[late & early & np.isin(seen[:, 1], list(places))]
     if not len(seen):
         raise DatasetError(f"{path}: sees no landmark while the truth lasts; give ROBOT{_MRCLAM}")
+    seen = seen[np.unique(seen[:, :2], axis=0, return_index=True)[1]]
     stamps, frames = np.unique(seen[:, 0], return_inverse=True)
     course[2] = np.unwrap(course[2])
-    at = np.column_stack([np.interp(stamps, seconds, one) for one in course])
-    x, y = (np.array([places[one] for one in seen[:, 1]]) - at[frames, :2]).T
-    off = seen[:, 2:] - np.column_stack([np.hypot(x, y), np.arctan2(y, x) - at[frames, 2]])
+    poses = _poses_at(stamps, seconds, course)
+    turned = np.append(0.0, np.cumsum(rate[:-1] * np.diff(times)))
+    way = speed[:-1] * np.diff(times) * np.exp(0.5j * (turned[1:] + turned[:-1]))
+    at = np.append(0.0, np.cumsum(way))
+    driven = _poses_at(stamps, times, (at.real, at.imag, turned))
+    points = np.array([places[one] for one in seen[:, 1]])
+    x, y = (inverse(poses[frames]) @ points[:, :, None])[:, :2, 0].T
+    off = seen[:, 2:] - np.column_stack([np.hypot(x, y), np.arctan2(y, x)])
     off[:, 1] = wrap(off[:, 1])
-    variances = (_OF_MEDIAN * np.median(np.abs(off), axis=0)) ** 2
-    log, model, noise = MeasurementLog(), RangeBearing(), np.diag([*variances, _STIFF])
+    sigmas = np.tile(_OF_MEDIAN * np.median(np.abs(off), axis=0), (len(seen), 1))
+    log = MeasurementLog()
     for k, stamp in enumerate(stamps.tolist()):
-        own = seen[frames == k]
-        own = own[np.unique(own[:, 1], return_index=True)[1]]
-        values = np.column_stack([own[:, 2:], np.zeros(len(own))])
-        measured = [model.measured(values, noise, own[:, 1].astype(np.int64))]
-        step = None
-        if k:
-            first, last = np.searchsorted(speeds[:, 0], [stamps[k - 1], stamp], "right")
-            bounds = np.array([stamps[k - 1], *speeds[first:last, 0], stamp])
-            step = _wheels(speeds[first - 1 : last, 1:] * np.diff(bounds)[:, None])
-        log.append(Increment.of(k, stamp, step, measured))
-    return log, Trajectory(stamps, np.array([_in_plane(*one) for one in at]))
+        step = _by_wheels(inverse(driven[k - 1]) @ driven[k]) if k else None
+        own, ids = seen[frames == k, 2:], seen[frames == k, 1].astype(np.int64)
+        log.append(Increment.of(k, stamp, step, [seen_in_plane(own, sigmas[: len(own)], ids)]))
+    return log, Trajectory(stamps, poses)
 
 
 _MRCLAM = "_Measurement.dat"  # of a robot, by which it is named
@@ -210,7 +211,9 @@ def run_classic(
         DatasetError: a file cannot be read.
     """
     if name == "kitti00":
-        yield from _tracks(name, steps)
+        opened = open_stereo_tracks(StereoTracksSettings(stop=steps), ConstantVelocitySettings())
+        count = sum(len(one.observations) for one in opened.log)
+        yield from _replayed(name, opened.log, opened.ground_truth, count, _TRACKED)
         return
     if name in _HEADING or name.endswith(_MRCLAM):
         log, where = _ranges(name) if name in _HEADING else _barcodes(Path(name))
@@ -243,12 +246,6 @@ def _row(
     return ClassicRow(name, kind, count, measurements, metrics.ate_rmse_m,
                       metrics.nees_pose_per_dof, solved.chi_square, float(times.mean()),
                       float(times.max()))  # fmt: skip
-
-
-def _tracks(name: str, steps: int | None) -> Iterator[ClassicRow]:
-    opened = open_stereo_tracks(StereoTracksSettings(stop=steps), ConstantVelocitySettings())
-    count = sum(len(one.observations) for one in opened.log)
-    yield from _replayed(name, opened.log, opened.ground_truth, count, _TRACKED)
 
 
 def _replayed(

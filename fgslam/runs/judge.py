@@ -330,7 +330,7 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
     log, arrival = MeasurementLog.load(file), arrival_of(file.parent)
     halves = []
     for half in (0, 1):
-        found = replay(half_of(log, half), settings, config.frontend.ego_motion, arrival=arrival)
+        found = replay(part_of(log, half), settings, config.frontend.ego_motion, arrival=arrival)
         if found.failure:
             raise DatasetError(
                 f"{name}: half of its landmarks do not do: {found.failure}; give --truth FILE"
@@ -344,10 +344,10 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
     return Estimate(first.trajectory, both, NO_LANDMARKS, relative=relative), second.trajectory
 
 
-def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
-    """The log with every second landmark alone; those that a loop merges stay together.
+def part_of(log: MeasurementLog, part: int, parts: int = 2) -> MeasurementLog:
+    """The log with one landmark in so many alone; those that a loop merges stay together.
 
-    What is measured of poses alone stays in both, as odometry does.
+    What is measured of poses alone stays in all, as odometry does.
     """
     stays: dict[int, int] = {}
 
@@ -356,36 +356,32 @@ def half_of(log: MeasurementLog, half: int) -> MeasurementLog:
             identity = stays[identity]
         return identity
 
-    for loop in (loop for one in log for loop in one.loops):
-        for pair in loop.merged.tolist():
-            ends, stay = map(root, pair)
-            if ends != stay:
-                stays[ends] = stay
+    for ends, stay in (pair for one in log for loop in one.loops for pair in loop.merged.tolist()):
+        if root(ends) != root(stay):
+            stays[root(ends)] = root(stay)
 
     def kept(ids: IntArray) -> BoolArray:
-        return np.array([root(i) % 2 == half for i in ids.tolist()], np.bool_)
+        return np.array([root(i) % parts == part for i in ids.tolist()], np.bool_)
+
+    def own(seen: Any) -> Any:
+        return seen.select(kept(seen.ids))
 
     out = MeasurementLog(log.rig, log.motion_model)
     for one in log:
-        mine, missed, pruned = (
-            kept(ids) for ids in (one.observations.ids, one.missed_ids, one.pruned_ids)
-        )
-        loops = tuple(
-            replace(
-                loop,
-                observations=loop.observations.select(kept(loop.observations.ids)),
-                merged=loop.merged[kept(loop.merged[:, 0])],
-            )
+        loops = (
+            replace(loop, observations=own(loop.observations),
+                    merged=loop.merged[kept(loop.merged[:, 0])])
             for loop in one.loops
+        )  # fmt: skip
+        out.append(
+            replace(
+                one,
+                observations=own(one.observations),
+                rejected=one.rejected[kept(one.observations.ids)],
+                missed_ids=one.missed_ids[kept(one.missed_ids)],
+                pruned_ids=one.pruned_ids[kept(one.pruned_ids)],
+                loops=tuple(loops),
+                measured=tuple(m if m.of_pose else own(m) for m in one.measured),
+            )
         )
-        half_of_one = replace(
-            one,
-            observations=one.observations.select(mine),
-            rejected=one.rejected[mine],
-            missed_ids=one.missed_ids[missed],
-            pruned_ids=one.pruned_ids[pruned],
-            loops=loops,
-            measured=tuple(m if m.of_pose else m.select(kept(m.ids)) for m in one.measured),
-        )
-        out.append(half_of_one)
     return out

@@ -14,7 +14,7 @@ from running import Capture, Patch, main, units_in_this_process
 import fgslam as fg
 from fgslam.core.log import MeasurementLog
 from fgslam.runs.config import make_config
-from fgslam.runs.judge import half_of
+from fgslam.runs.judge import part_of
 from fgslam.runs.run import run_experiment
 
 KIND = "landmark_kalman"
@@ -101,7 +101,7 @@ def test_an_estimator_of_a_comparison_is_judged_by_what_its_run_knows(
 
 def test_halves_share_no_landmark_and_lose_none(run: Path) -> None:
     log = MeasurementLog.load(run / "measurements.npz")
-    halves = [half_of(log, k) for k in (0, 1)]
+    halves = [part_of(log, k) for k in (0, 1)]
     for whole, first, second in zip(log, *halves, strict=True):
         parts = [one.observations.ids for one in (first, second)]
         assert not np.intersect1d(*parts).size

@@ -56,7 +56,6 @@ class Track:
         elsewhere: world positions and covariances of its rejected sightings since the last one
             that fitted.
         left_at: world position and covariance with which it last left a bounded lag.
-        stays: in a bounded lag, as no measurement of it fixes a point by itself.
     """
 
     least_parallax: float
@@ -66,7 +65,6 @@ class Track:
     sightings: int = 0
     elsewhere: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     left_at: tuple[FloatArray, FloatArray] | None = None
-    stays: bool = False
 
     @property
     def by_camera(self) -> bool:
@@ -80,6 +78,7 @@ class LandmarkAdmission:
     Attributes:
         tracks: by the landmark's identity.
         first_frame: of a bounded lag; 0 where there is none.
+        staying: variables in a lag of landmarks that no measurement fixes by itself.
         remarks: which landmarks started again, in words.
     """
 
@@ -88,7 +87,7 @@ class LandmarkAdmission:
         self._sensor = sensor
         self._settings = settings
         self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self.first_frame = 0
+        self.first_frame, self.staying = 0, list[int]()
         self.tracks: dict[int, Track] = {}
         self.by_last_sighting: dict[int, Track] = {}
         self.remarks: list[str] = []
@@ -227,7 +226,7 @@ class LandmarkAdmission:
         left = [
             (i, track)
             for i, track in self.by_last_sighting.items()
-            if track.last.frame < frame and not track.stays
+            if track.last.frame < frame and track.variable not in self.staying
         ]
         for identity, _ in left:
             del self.by_last_sighting[identity]

@@ -266,7 +266,7 @@ class GraphBuilder:
         self._add_measured(new, tracked, landmarks)
         if self._remember:
             gone = np.zeros(len(new.sightings), np.bool_)
-            self.observed.append(_columns(new.sightings) | {"gone": gone})
+            self.observed.append(sighting_columns(new.sightings) | {"gone": gone})
             self.measured = by_kind([*self.measured.values(), *new.measured])
         return new
 
@@ -361,7 +361,7 @@ class GraphBuilder:
 
     def observation_factors(self, new: NewFactors) -> Any:
         """C++ factors of a frame's observations of landmarks, weighed as is known now."""
-        out = self._observation_factors(*_columns(new.sightings).values())
+        out = self._observation_factors(*sighting_columns(new.sightings).values())
         for one in new.measured:
             if one.model.has_factor:
                 out.push_back(one.factors())
@@ -504,7 +504,7 @@ class GraphBuilder:
                     if not self._remember and self._waiting[identity][0][0] < frame:
                         self._waiting[identity] = [(frame, self._found(tracked, landmarks, at))]
                     kinds = {one.kind for _, one in self._waiting[identity]}
-                    track.stays = RelativePoint.kind in kinds
+                    self.admission.staying += [track.variable] * (RelativePoint.kind in kinds)
             if track.variable >= 0:
                 for seen, one in self._waiting.pop(identity):
                     if seen >= self.admission.first_frame:
@@ -578,7 +578,7 @@ class GraphBuilder:
         return int(self.graph.size()) - 1
 
 
-def _columns(sightings: list[tuple[int, Sighting]]) -> dict[str, Any]:
+def sighting_columns(sightings: list[tuple[int, Sighting]]) -> dict[str, Any]:
     """Frames (k,), variables (k,), measurements (k, 3) and covariances (k, 3, 3)."""
     return {
         "frame": np.array([s.frame for _, s in sightings], np.int64),

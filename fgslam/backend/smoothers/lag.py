@@ -17,7 +17,6 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.loops import Chain, Constraint, changes, constraint_factor, nearest_positive
-from fgslam.backend.measured import RelativePoint
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.admission import Track
@@ -31,6 +30,7 @@ from fgslam.backend.smoothers.graph import (
     allowed_parts,
     closed_chain,
     drift_undone,
+    sighting_columns,
     solver_failed,
 )
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother, Smoother
@@ -86,7 +86,6 @@ class FixedLagSolver:
         self.window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
-        self._staying: list[int] = []  # landmark variables that no measurement fixes by itself
         self.poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self.remarks: list[str] = []
@@ -186,18 +185,11 @@ class FixedLagSolver:
         if entered:
             self.window.add_landmarks(_landmarks(new, entered))
         if new.sightings:
-            self.window.observe(
-                np.array([s.frame for _, s in new.sightings], np.int64),
-                np.array([v for v, _ in new.sightings], np.int64),
-                np.array([s.measurement for _, s in new.sightings]),
-                self.builder.noise.power * np.array([s.covariance for _, s in new.sightings]),
-            )
-
+            *seen_by_camera, noise = sighting_columns(new.sightings).values()
+            self.window.observe(*seen_by_camera, self.builder.noise.power * noise)
         for one in new.measured:
             nuisance = self._tracker.nuisance(one.model.kind)
             self.window.measure(one.considering(*nuisance) if nuisance else one)
-            if one.model.kind == RelativePoint.kind:
-                self._staying += (one.points - landmark_key(0)).tolist()
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""
@@ -219,7 +211,7 @@ class FixedLagSolver:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
         self._oldest = max(self._oldest, len(self.poses) - 1 - self._lag)
         try:
-            self.window.let_go_before(self._oldest, self._staying)
+            self.window.let_go_before(self._oldest, self.builder.admission.staying)
         except (UndeterminedError, np.linalg.LinAlgError) as error:
             raise self._failed(error) from None
         last_seen: dict[int, list[tuple[int, Track]]] = {}

@@ -17,7 +17,7 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, LoopClosure
 from fgslam.core.types import Trajectory, pose_rows
 from fgslam.factors.models import Position, Range
-from fgslam.runs.judge import half_of
+from fgslam.runs.judge import part_of
 
 FRAMES = 80
 SIGMA = np.repeat([0.004, 0.05], 3)
@@ -165,7 +165,7 @@ def test_landmarks_that_loops_merge_one_after_another_are_of_one_half() -> None:
         log.append(
             replace(nothing, index=k, timestamp=float(k), missed_ids=ids, loops=tuple(loops))
         )
-    halves = [half_of(log, half) for half in (0, 1)]
+    halves = [part_of(log, half) for half in (0, 1)]
     assert [one.missed_ids.tolist() for one in halves[0]] == 3 * [[6]]
     assert [one.missed_ids.tolist() for one in halves[1]] == 3 * [[9, 4, 3]]
     assert [len(loop.merged) for one in halves[1] for loop in one.loops] == [1, 1]
@@ -175,7 +175,7 @@ def test_landmarks_of_other_sensors_are_divided_and_measured_poses_are_of_both_h
     log = MeasurementLog()
     ranges = Range().measured([[1.0], [2.0], [3.0]], [[0.01]], ids=[4, 7, 9])
     log.append(Increment.of(0, 0.0, None, [ranges, Position().measured([[0.0] * 3], np.eye(3))]))
-    (even,), (odd,) = (half_of(log, half) for half in (0, 1))
+    (even,), (odd,) = (part_of(log, half) for half in (0, 1))
     assert [one.measured[0].ids.tolist() for one in (even, odd)] == [[4], [7, 9]]
     assert even.measured[0].values.tolist() == [[1.0]]
     assert [len(one.measured[1]) for one in (even, odd)] == [1, 1]
