@@ -185,8 +185,8 @@ class FixedLagSolver:
         if entered:
             self.window.add_landmarks(_landmarks(new, entered))
         if new.sightings:
-            *seen_by_camera, noise = sighting_columns(new.sightings).values()
-            self.window.observe(*seen_by_camera, self.builder.noise.power * noise)
+            frame, variable, measured, noise = sighting_columns(new.sightings).values()
+            self.window.observe(frame, variable, measured, self.builder.noise.power * noise)
         for one in new.measured:
             nuisance = self._tracker.nuisance(one.model.kind)
             self.window.measure(one.considering(*nuisance) if nuisance else one)
