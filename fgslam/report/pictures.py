@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -497,37 +497,6 @@ class PathPicture:
     image: Image | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RouteMoment:
-    """One image along a route, and the command that it gives.
-
-    Attributes:
-        image: as recorded; None where it cannot be read.
-        title: above the image.
-        nearest, probability: path image, and that it or a neighbour is the nearest; None where
-            nothing is known of the place.
-        target: path image to go to; None likewise.
-        direction, sigma: of the homing vector from the heading, to the left positive, and its
-            deviation, radians; NaN where it is refused.
-        beam, ahead: (m, 2) pixels along that direction, and along the heading, in the image; NaN
-            where not in view.
-        command: speed and turning rate, or why there is no homing vector.
-        refused: whether it is the latter.
-    """
-
-    image: Image | None
-    title: str
-    nearest: int | None
-    probability: float
-    target: int | None
-    direction: float
-    sigma: float
-    beam: FloatArray
-    ahead: FloatArray
-    command: str
-    refused: bool
-
-
 class RouteCanvas:
     """A route that is followed: image, path image, homing vector and place."""
 
@@ -545,26 +514,45 @@ class RouteCanvas:
         self._panels = [self._figure.add_subplot(place) for place in places]
 
     @_styled
-    def draw(self, moment: RouteMoment) -> Image:
-        """The frame (720, 1280, 3) in red, green, blue."""
+    def draw(
+        self,
+        row: Mapping[str, Any],
+        image: Image | None,
+        lines: tuple[FloatArray, FloatArray],
+        command: str,
+    ) -> Image:
+        """The frame (720, 1280, 3) in red, green, blue.
+
+        Args:
+            row: of follow.csv by name of the column; numbers are NaN where they are not known.
+            image: as recorded; None where it cannot be read.
+            lines: (m, 2) pixels along the heading, and along the homing vector; NaN where not in
+                view.
+            command: speed and turning rate, or why there is no homing vector.
+        """
+        nearest, target = (
+            int(row[column]) if np.isfinite(row[column]) else None
+            for column in ("path_image", "target")
+        )
+        title = f"{row['name']} at {row['time_s']:.1f} s"
         for axes in self._panels:
             axes.clear()
-        image, remembered, compass, route = self._panels
-        if moment.image is None:
-            image.set_axis_off()
-            image.set_title(moment.title)
+        seen, remembered, compass, route = self._panels
+        if image is None:
+            seen.set_axis_off()
+            seen.set_title(title)
         else:
-            show_image(image, moment.image, moment.title, "white: ahead, orange: home")
-            add_segments(image, moment.ahead[None], 1.2, "white")
-            if np.isfinite(moment.beam).any():
-                add_segments(image, moment.beam[None], 2.5, ORANGE)
-        if moment.nearest is None:
+            show_image(seen, image, title, "white: ahead, orange: home")
+            add_segments(seen, lines[0][None], 1.2, "white")
+            if np.isfinite(lines[1]).any():
+                add_segments(seen, lines[1][None], 2.5, ORANGE)
+        if nearest is None:
             remembered.set_axis_off()
             remembered.set_title("Path image: not known")
         else:
-            _draw_remembered(remembered, self._path[moment.nearest], moment.nearest)
-        _draw_compass(compass, moment)
-        _draw_route(route, moment, len(self._path) - 1)
+            _draw_remembered(remembered, self._path[nearest], nearest)
+        _draw_compass(compass, row, command)
+        _draw_route(route, nearest, target, row["probability"], len(self._path) - 1)
         agg: Any = self._figure.canvas
         agg.draw()
         return np.asarray(agg.buffer_rgba())[..., :3].copy()
@@ -582,41 +570,43 @@ def _draw_remembered(axes: Axes, shown: PathPicture, number: int) -> None:
     axes.set_title(title)
 
 
-def _draw_compass(axes: Axes, moment: RouteMoment) -> None:
+def _draw_compass(axes: Axes, row: Mapping[str, Any], command: str) -> None:
     """The robot from above, ahead is up: an arrow home with its deviation, and the command."""
     axes.add_patch(Circle((0.0, 0.0), 1.0, fill=False, color=FAINT, linewidth=1.5))
     axes.add_patch(Polygon([[-0.1, -0.1], [0.1, -0.1], [0.0, 0.16]], color=INK))
     axes.text(0.0, 1.06, "ahead", ha="center", va="bottom", fontsize=10.0)
-    if np.isfinite(moment.direction):
-        around = moment.direction + moment.sigma * np.linspace(-1.0, 1.0, 21)
+    direction, sigma = np.deg2rad([row["direction_deg"], row["sigma_direction_deg"]]).tolist()
+    if np.isfinite(direction):
+        around = direction + sigma * np.linspace(-1.0, 1.0, 21)
         rim = np.column_stack([-np.sin(around), np.cos(around)])
         axes.add_patch(Polygon([[0.0, 0.0], *rim.tolist()], color=ORANGE, alpha=0.3))
-        tip = (-np.sin(moment.direction), np.cos(moment.direction))
+        tip = (-np.sin(direction), np.cos(direction))
         arrow = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 3.0, "mutation_scale": 22.0}
         axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow)
-    lines = [part for line in moment.command.splitlines() for part in wrap(line, _LINE)]
+    lines = [part for line in command.splitlines() for part in wrap(line, _LINE)]
     if len(lines) > _LINES:
         lines = [*lines[: _LINES - 1], lines[_LINES - 1] + " ..."]
-    colour = VERMILLION if moment.refused else INK
+    colour = VERMILLION if row["refusal"] and row["state"] != "arrived" else INK
     axes.text(1.3, 0.0, "\n".join(lines), va="center", color=colour, linespacing=1.5)
     axes.set(xlim=(-1.2, 4.3), ylim=(-1.15, 1.3), aspect="equal", anchor="W")
     axes.set_axis_off()
     axes.set_title("Homing vector")
 
 
-def _draw_route(axes: Axes, moment: RouteMoment, last: int) -> None:
+def _draw_route(
+    axes: Axes, nearest: int | None, target: int | None, probability: float, last: int
+) -> None:
     """The path images in a row; where the robot is, and where it goes next."""
     axes.plot([0, last], [0, 0], color=FAINT, linewidth=3.0, zorder=1)
     axes.plot(np.arange(last + 1), np.zeros(last + 1), "o", color=_DOTS, markersize=7.0)
     title = "Place: not known"
-    if moment.nearest is not None:
-        axes.plot(moment.nearest, 0.0, "o", color=SKY, markersize=15.0)
-        share = 100 * moment.probability
-        title = f"Place: path image {moment.nearest}, probability {share:.0f} %"
-    if moment.target not in (None, moment.nearest):
+    if nearest is not None:
+        axes.plot(nearest, 0.0, "o", color=SKY, markersize=15.0)
+        title = f"Place: path image {nearest}, probability {100 * probability:.0f} %"
+    if target is not None and target != nearest:
         ring: dict[str, Any] = {"fillstyle": "none", "color": ORANGE, "markeredgewidth": 2.5}
-        axes.plot(moment.target, 0.0, "o", markersize=20.0, **ring)
-        title += f"; next {moment.target}"
+        axes.plot(target, 0.0, "o", markersize=20.0, **ring)
+        title += f"; next {target}"
     axes.set(xlim=(-0.5, last + 0.5), ylim=(-1.0, 1.0), yticks=[], title=title)
     axes.set_xticks(np.arange(0, last + 1, -(-(last + 1) // _MOST_NAMED)))
     axes.tick_params(length=0.0)

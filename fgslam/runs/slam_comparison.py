@@ -54,8 +54,6 @@ def open_slam_comparison(
     notes = read_metrics(metrics_file).get("notes") if metrics_file.is_file() else None
     about: dict[str, JsonValue] = {
         "run": str(run),
-        "odometry": config.odometry.kind,
-        "remark": config.remark or None,
         "notes": [str(note) for note in notes or ()],  # what was tolerated in the recording
     }
 
@@ -149,7 +147,8 @@ def write_comparison(
     out = context.folder
     status: Status = "interrupted" if context.stopped() else "finished"
     values = {title: one.as_json() for title, one in metrics.items()}
-    own: dict[str, JsonValue] = {"name": config.name, "status": status, **about}
+    own: dict[str, JsonValue] = {"name": config.name, "status": status}
+    own |= {"odometry": config.odometry.kind, "remark": config.remark or None, **about}
     write_metrics(out / METRICS_FILE, frames, metrics, own)
     write_comparison_csv(out / COMPARISON_FILE, [(config.name, with_odometry(config, values))])
     if config.output.report:

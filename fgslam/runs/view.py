@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fgslam.cameras.omni import OmniCamera, unit_rays
+from fgslam.cameras.omni import unit_rays
 from fgslam.core.arrays import FloatArray, Image, IntArray, thinned
 from fgslam.core.errors import (
     ConfigError,
@@ -43,7 +43,7 @@ from fgslam.report.content import (
 )
 from fgslam.report.formats import read_ply
 from fgslam.report.overlays import FilmCanvas
-from fgslam.report.pictures import PathPicture, RouteCanvas, RouteMoment
+from fgslam.report.pictures import PathPicture, RouteCanvas
 from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.config import (
     Experiment,
@@ -225,7 +225,12 @@ def _film_of_following(
             image = None
             if (at := places.get(int(row["image"]))) is not None:
                 image = _readable(recording.image, at)
-            yield canvas.draw(_route_moment(row, image, recording.camera))
+            # What lies ahead, and towards home.
+            ahead, home = (
+                recording.camera.pixels(unit_rays(np.full(len(_BEAM), bearing), _BEAM))
+                for bearing in (0.0, np.deg2rad(row["direction_deg"]))
+            )
+            yield canvas.draw(row, image, (ahead, home), command_text(row))
 
     return np.array([row["time_s"] for row in rows]), frames()
 
@@ -251,31 +256,6 @@ def _taught_recording(taught: Path, path: PathMemory) -> OmniRecording:
     if not same or not set(path.names) <= set(recording.names):
         raise StoredMapError(f"{taught}: taught another route than the one that was followed")
     return recording
-
-
-def _route_moment(row: Row, image: Image | None, camera: OmniCamera) -> RouteMoment:
-    def beam(bearing: float) -> FloatArray:
-        """(m, 2) pixels that show what lies in a direction; NaN where it is not in view."""
-        return camera.pixels(unit_rays(np.full(len(_BEAM), bearing), _BEAM))
-
-    nearest, target = (
-        int(row[column]) if np.isfinite(row[column]) else None
-        for column in ("path_image", "target")
-    )
-    direction = float(np.deg2rad(row["direction_deg"]))
-    return RouteMoment(
-        image=image,
-        title=f"{row['name']} at {row['time_s']:.1f} s",
-        nearest=nearest,
-        probability=row["probability"],
-        target=target,
-        direction=direction,
-        sigma=float(np.deg2rad(row["sigma_direction_deg"])),
-        beam=beam(direction),
-        ahead=beam(0.0),
-        command=command_text(row),
-        refused=bool(row["refusal"]) and row["state"] != "arrived",
-    )
 
 
 def command_text(row: Row) -> str:

@@ -56,8 +56,6 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
     write_timing(folder / "timing.csv", times)
     about: dict[str, JsonValue] = {
         "frames_in_recording": len(recording.log),
-        "odometry": config.odometry.kind,
-        "remark": config.remark or None,
         "notes": list(recording.notes),
         "status_counts": dict(sorted(Counter(row["status"] for row in rows).items())),
         "landmark_matches": count_spread(np.array([row["inliers"] for row in rows[1:]], np.int64)),
