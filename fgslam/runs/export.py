@@ -103,12 +103,26 @@ def export_run(
         read, rig = partial(read_ply, folder / "map.ply"), lambda: log().rig
     lines = [f"note: {remark}"] if remark else []
     if wanted.trajectory is not None:
-        saved_as = _save(wanted.trajectory, wanted, trajectory, folder, rig, remark)
-        bare = folder is not None and wanted.trajectory.suffix.lower() == ".kitti"
-        lines.append(saved_as + (line_numbers(trajectory, log()) if bare else ""))
+        covariances = np.full((len(trajectory), 6, 6), np.nan)
+        if folder is not None and wanted.is_bag:
+            covariances = read_covariances(folder / "covariance.csv")[1]
+        found = Estimate(trajectory, covariances, NO_LANDMARKS)
+        if wanted.frame not in (None, trajectory.frame):
+            if wanted.frame == "body" and body_is_camera(rig().bTc):
+                raise ConfigError(
+                    "--frame body: nothing states where the cameras sit on a body; give --frame "
+                    "left, or run with dataset.camera_yaw_deg and dataset.lever_arm_m"
+                )
+            found = found.of(wanted.frame, rig())
+        path, axes = wanted.trajectory, wanted.chosen_axes
+        write_trajectory(path, found.trajectory, found.covariances, remark, axes)
+        bare = folder is not None and path.suffix.lower() == ".kitti"
+        about = line_numbers(trajectory, log()) if bare else ""
+        named = found.trajectory.named
+        lines.append(f"{path}: {len(found.trajectory)} poses, {named}{about}")
     if wanted.is_dense:
-        found = dense_map(run, wanted.estimator, how, wanted.recording, progress, log())
-        lines += save_dense(found, wanted, remark)
+        dense = dense_map(run, wanted.estimator, how, wanted.recording, progress, log())
+        lines += save_dense(dense, wanted, remark)
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines
     points = read()
@@ -242,33 +256,6 @@ def sources_of(run: Path) -> tuple[Path, ...]:
     if not is_run_folder(run):
         return (run,)
     return (run, *load_experiment(run / RUN_MARKER).inputs)
-
-
-def _save(
-    path: Path,
-    wanted: Wanted,
-    trajectory: Trajectory,
-    folder: Path | None,
-    rig: Callable[[], CameraRig],
-    remark: str,
-) -> str:
-    """Writes a trajectory; of an estimator, with its folder, .mcap has covariances.
-
-    The rig is asked for where the poses are to be of another frame.
-    """
-    covariances = np.full((len(trajectory), 6, 6), np.nan)
-    if folder is not None and wanted.is_bag:
-        covariances = read_covariances(folder / "covariance.csv")[1]
-    found = Estimate(trajectory, covariances, NO_LANDMARKS)
-    if wanted.frame not in (None, trajectory.frame):
-        if wanted.frame == "body" and body_is_camera(rig().bTc):
-            raise ConfigError(
-                "--frame body: nothing states where the cameras sit on a body; give --frame left, "
-                "or run with dataset.camera_yaw_deg and dataset.lever_arm_m"
-            )
-        found = found.of(wanted.frame, rig())
-    write_trajectory(path, found.trajectory, found.covariances, remark, wanted.chosen_axes)
-    return f"{path}: {len(found.trajectory)} poses, {found.trajectory.named}"
 
 
 def log_of(run: Path) -> Path:

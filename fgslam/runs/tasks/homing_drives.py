@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -78,10 +78,6 @@ _TRAIL = 15  # images
 # One drive
 
 
-Opened: TypeAlias = "tuple[OmniWorld, ImageFrontEnd, PathMemory, FloatArray]"
-"""World, its robot at the start; front-end; path; (m, 3) poses where its images were taken."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LegView:
     """The last image of a leg in which the target was tracked.
@@ -120,17 +116,14 @@ class DrivenSeed:
     views: tuple[LegView, ...] = ()
 
 
-def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
-    """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
-    world, front_end = _open_house(config, seed)
-    taught = teach(world.targets, world.calibration, features=config.features)
-    memory = PathMemory.of(taught.images)  # the front-end has the camera
-    return world, front_end, memory, world.target_poses
+def way_over_routes(
+    world: OmniWorld, config: CrossroadsConfig, seed: int
+) -> tuple[PathMemory, FloatArray]:
+    """A way over two routes, from the end of one to that of the other, where the robot is put.
 
-
-def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
-    """The same with a way over two routes, from the end of one to that of the other."""
-    world, front_end = _open_house(config, seed)
+    Returns:
+        The path, and (m, 3) poses where its images were taken.
+    """
     poses = world.crossing_routes()
     routes = {}
     for number, name in enumerate(_ROUTES):
@@ -147,19 +140,20 @@ def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
         with suppress(StoredMapError):  # no way
             way = joined.way(place, end)
     at = [joined.names.index(name) for name in way.names]
-    return world, front_end, PathMemory(way.images, way.names), every[at]
-
-
-def _open_house(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFrontEnd]:
-    world = open_house(config.dataset, seed)
-    settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
-    return world, make_front_end(world.calibration, settings, seed)
+    return PathMemory(way.images, way.names), every[at]
 
 
 def perform_drive(config: DrivingConfig, seed: int) -> DrivenSeed:
-    """One drive from start to end."""
-    opener = open_crossroads_drive if isinstance(config, CrossroadsConfig) else open_house_drive
-    world, front_end, memory, poses = opener(config, seed)  # type: ignore[arg-type]
+    """One drive from start to end. Raises FgslamError where the house cannot be built."""
+    world = open_house(config.dataset, seed)
+    settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
+    front_end = make_front_end(world.calibration, settings, seed)
+    if isinstance(config, CrossroadsConfig):
+        memory, poses = way_over_routes(world, config, seed)
+    else:
+        taught = teach(world.targets, world.calibration, features=config.features)
+        # The front-end has the camera.
+        memory, poses = PathMemory.of(taught.images), world.target_poses
     behaviour = config.behaviour
     if config.start_offset_m > 0.0:
         rng = np.random.default_rng((seed, 7))
