@@ -393,12 +393,7 @@ class Bordered:
 
 
 class UndeterminedError(EstimatorError):
-    """The measurements do not determine all variables; ``row`` of the first one's, as ordered."""
-
-    def __init__(self, row: int, message: str) -> None:
-        """Row of the information matrix and the message."""
-        super().__init__(message)
-        self.row = row
+    """The measurements do not determine all variables."""
 
 
 def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -408,14 +403,14 @@ def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
-        raise UndeterminedError(int(np.argmin(size > 0.0)), UNDETERMINED)
+        raise UndeterminedError(UNDETERMINED)
     scaled = information / size[:, None] / size
     factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
     if status != 0:
-        raise UndeterminedError(int(status) - 1, UNDETERMINED)
+        raise UndeterminedError(UNDETERMINED)
     pivots = np.diagonal(factor)
     if len(pivots) and pivots.min() ** 2 < _ROUNDING:
-        raise UndeterminedError(int(pivots.argmin()), UNDETERMINED)
+        raise UndeterminedError(UNDETERMINED)
     return factor, size
 
 
@@ -459,7 +454,7 @@ class UndeterminedLandmarkError(UndeterminedError):
 
     def __init__(self, rows: IntArray) -> None:
         """Rows of the landmarks."""
-        super().__init__(int(rows[0]), "a landmark's observations do not determine it")
+        super().__init__("a landmark's observations do not determine it")
         self.rows = rows
 
 

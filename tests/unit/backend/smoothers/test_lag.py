@@ -238,7 +238,7 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
 
 
 @pytest.mark.parametrize(
-    "error", [UndeterminedError(4, "a pose"), np.linalg.LinAlgError("odd\nwords")]
+    "error", [UndeterminedError("a pose"), np.linalg.LinAlgError("odd\nwords")]
 )
 def test_failure_beyond_repair_is_one_clear_line(error: Exception) -> None:
     simulation, estimator = drawn(8, frames=12), smoother()
@@ -389,7 +389,7 @@ def test_what_is_known_too_unevenly_is_begun_again_with_a_remark(
     def once(self: Window) -> Solved:
         if self.frames[-1] >= 10 and not failed:
             failed.append(self.frames[0])
-            raise UndeterminedError(0, "not determined")
+            raise UndeterminedError("not determined")
         return solve(self)
 
     monkeypatch.setattr(Window, "solve", once)
