@@ -74,6 +74,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "consistency": lambda data: consistency.tables(),
     "compact_memory": lambda data: compact_memory.tables(),
     "witnesses": witnesses.tables,
+    "witnesses_seeds": lambda data: [witnesses.seeds_table()],
     "wrong_mirror": lambda data: wrong_mirror.tables(),
     "unmapped": lambda data: relocalising.unmapped_tables(),
     "recognised": relocalising.recognised_tables,

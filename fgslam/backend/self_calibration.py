@@ -27,7 +27,7 @@ from fgslam.core.correction import (
     prior_information,
     term_names,
 )
-from fgslam.core.geometry import in_front, moved_apart, point_pose_jacobian
+from fgslam.core.geometry import congruence, in_front, moved_apart, point_pose_jacobian
 from fgslam.core.sensors import (
     CameraRig,
     Increment,
@@ -91,6 +91,7 @@ class SelfCalibration:
     moved_at: Kept[list[int]]
     moved_before: Kept[bool]
     suspected: Kept[int | None]
+    _failed: Kept[int]
     _open: Kept[FloatArray]
     _seen: Kept[int]
     _frames: Kept[list[tuple[FloatArray, Observations]]]
@@ -126,17 +127,13 @@ class SelfCalibration:
         """Whether it was found to have moved since the drives that it began with."""
         self.suspected = None
         """Frame from which on the rig seems to be another one, while that is undecided."""
-        self._open = np.zeros(6)  # a frame's motion by one rig, seen from that by two
+        self._failed = 0  # frame in which no landmark fitted, of the windows to come
+        self._open = np.zeros((6, 6))  # of a frame's motion, by what is open of the rig
         self._applied = self.found.applied.values
         self._seen = 0
         self._sigma = pixel_sigma
         self._frames = []
         self._last_time = None
-
-    @property
-    def noise_factor(self) -> float:
-        """Variance of the windows' evidence, as multiple of what their pixels alone would give."""
-        return self._known.noise_factor(self._unknowns)
 
     @property
     def field_px(self) -> float:
@@ -185,8 +182,14 @@ class SelfCalibration:
         ``passes``: something that moves is in view; the frame is no evidence.
         """
         self._seen += 1
-        if increment.relocalised or passes:
+        old = ~increment.observations.is_new
+        failed = old.sum() >= _FEWEST and bool(increment.rejected[old].all())
+        if increment.relocalised or passes or failed:
             self._frames.clear()
+        if failed and self._recent:  # as a knock makes them fail: known is what is stated
+            self._failed, prior = self._seen - 1, self._unknowns.prior(FIELD_PX)
+            stated = np.asarray(np.linalg.inv(prior)[(slice(self._unknowns.terms),) * 2])
+            self._open = congruence(self._recent[-1].evidence.moves, stated)
         if passes:
             return
         self._frames.append((wTc, increment.kept))
@@ -222,7 +225,9 @@ class SelfCalibration:
             self._known = windows[max(moved, 0)].before.without_terms(of)
             for one in windows[moved + 1 :]:  # it may have moved within one
                 self._known = self._known.judged(of, one.evidence)[1].after(of, one.evidence)
-        self.found = self._held(self._known.weighed(of))
+        self.found, self._failed = self._held(self._known.weighed(of)), 0
+        if self.moved_at:
+            self._open += congruence(evidence.moves, self.found.estimated.covariance)
         self._applied = self.found.applied.values
         known = self.found.estimated.values, self.found.estimated.covariance
         self.steps.append(CalibrationStep(timestamp, *known, self._applied, self.knocks))
@@ -240,10 +245,12 @@ class SelfCalibration:
         terms = slice(self._unknowns.terms)
         sure[0] *= self._recent[0].before.information[terms, terms].any()  # else nothing was known
         first, self.suspected = int(np.argmax(sure)), None
-        self._open = np.zeros(6)
+        self._open = np.zeros((6, 6))
+        if sure[first] > (0.0 if self.moved_at else likely):  # what has moved may be loose
+            off = self._recent[-1].evidence.moves @ moves[first].values
+            self._open = 0.5 * np.outer(off, off)
         if sure[first] <= likely:
             return None
-        self._open = self._recent[-1].evidence.moves @ moves[first].values
         if self._known.remembered and len(self._recent) == self.windows and sure[0] > likely:
             return -1
         if len(self._recent) - first >= _DECIDING:
@@ -251,10 +258,13 @@ class SelfCalibration:
         self.suspected = self._recent[first].first
         return None
 
-    def open_covariance(self) -> FloatArray:
-        """(6, 6) to be added to that of the last pose: one rig or two, until poses follow that."""
-        off = (self._seen - self.moves[-1]) * self._open if self.moves else self._open
-        return 0.5 * np.outer(off, off)
+    def open_covariances(self, count: int) -> FloatArray:
+        """(count, 6, 6) to be added to those of the last poses: what is open since the rig moved.
+
+        One rig or two, until poses follow that; then how well the new one is known.
+        """
+        since = np.arange(self._seen - count, self._seen) + 1.0 - [*self.moves, self._failed][0]
+        return np.asarray(np.maximum(since, 0.0)[:, None, None] ** 2 * self._open)
 
     def _moved(self, first: int) -> RigCorrection:
         """By how much the rig differs from a recent window on, if all before are of one rig."""
@@ -305,6 +315,7 @@ Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 
 Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
 """
 _KNOCK_PROBABILITY = 1e-6  # of a window, or of a knock, so far off by chance
+_FEWEST = 20  # landmarks of a frame: all of them fit no pose by chance
 _KNOCK_PX = 0.5  # root mean square over the image; less is left to the drift
 _UNOBSERVED = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 _SHAKE = 0.02 / 360.0

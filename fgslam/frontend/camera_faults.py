@@ -10,6 +10,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import TypeAlias
 
 import cv2
@@ -568,9 +569,11 @@ class CameraWatch:
                 flow = flow or _followed_of(now.images[0], self._before[0], points, shown)
                 since = flow[0][kept], flow[1][kept]
                 seen.append(self._judge(camera, now, (here, there), since))
-            else:
-                seen.append(self._still(pair, here, there))
-        fault = repeated or swapped or self._old()
+            else:  # as if at rest: how far points moved is not known
+                since, off = (here, np.ones(len(here), np.bool_)), there - here
+                seen.append(self._shifted(since, here, off[:, pair.model.across], there, pair))
+        old = f"{_named(self._late)} old images" if any(self._late) else ""
+        fault = repeated or swapped or old
         good = np.flatnonzero(~(np.array(self._late) | (self._same & bool(repeated))))
         self.alone = int(good[0]) if fault and not swapped and len(good) else None
         return fault, seen
@@ -660,12 +663,6 @@ class CameraWatch:
             pair.rows[1].clear()
         return rows
 
-    def _still(self, pair: _Pair, here: FloatArray, there: FloatArray) -> LineRows:
-        """Points (n, 2) of a first frame, as if at rest: how far they moved is not known."""
-        every = here, np.ones(len(here), np.bool_)
-        offset = (there - here)[:, pair.model.across]
-        return self._shifted(every, here, offset, there, pair)
-
     def _shifted(
         self,
         moved: Followed,
@@ -690,19 +687,12 @@ class CameraWatch:
         del window[:-_WINDOW]
         if abs(newest.late) > _SURE or len(window) == 1:
             return newest, newest
-        together = LineRows.none()
-        for one in window:
-            together = together.join(one)
-        return newest, pair.model.lag(self._signed(together, way), self._spread)
+        together = self._signed(reduce(LineRows.join, window), way)
+        return newest, pair.model.lag(together, self._spread)
 
     def _signed(self, rows: LineRows, way: int) -> LineRows:
         """The calibration displaces the other camera's points, from whichever it is looked at."""
-        if way == 0:
-            return rows
-        return LineRows(-rows.offset, -rows.shift, rows.place)
-
-    def _old(self) -> str:
-        return f"{_named(self._late)} old images" if any(self._late) else ""
+        return LineRows(-rows.offset, -rows.shift, rows.place) if way else rows
 
     # ----------------------------------------------------------------------------------------
 

@@ -490,6 +490,8 @@ SENTENCES = {
     "camera_turned": "the {camera} camera was turned by {turns}{against} at about frame {first} "
     "of the run, " + _FASTEN,
     "cameras_swapped": _PREDICTED + "(swap their images; " + _WATCH + ")",
+    "images_out_of_order": "the images of {count} frames, {span}, are out of order: they jump to "
+    "and fro while odometry goes on evenly (sort them by the time at which they were taken)",
     "left_out": "the first {count} frames could not be located: left out",
     "lost_bits": "{fault}",
     "no_features": _NO_MATCHES + "{left}; are the images dark, or 12-bit values in 16-bit images?",

@@ -147,7 +147,7 @@ class SlamPipeline:
         self._calibrate(increment, stats)
         mixed = stats.covariance + self.witnesses.open_covariance(stats.wTc)
         if self.calibration is not None:
-            mixed = mixed + self.calibration.open_covariance()
+            mixed = mixed + self.calibration.open_covariances(1)[0]
         stats = dataclasses.replace(stats, covariance=mixed)
         times = self.watch_of_frame.ms
         return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)
@@ -414,7 +414,11 @@ class SlamPipeline:
         found = self.estimator.estimate()
         if len(self._ended):
             found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
-        return bridged(self.witnesses.spread(found), self.tracker.parts)
+        found = self.witnesses.spread(found)
+        if self.calibration is not None:
+            more = self.calibration.open_covariances(len(found.covariances))
+            found = dataclasses.replace(found, covariances=found.covariances + more)
+        return bridged(found, self.tracker.parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

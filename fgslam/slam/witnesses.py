@@ -10,6 +10,7 @@ follows the images, and odometry goes on next to it: it may turn out to have bee
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
@@ -64,6 +65,7 @@ _ENDS = 5  # agreeing frames in a row end an episode
 _RATIOS, _FEWEST_RATIOS = 15, 5  # contradicted frames that tell the ratio of the ways
 _STUCK = 0.05  # ratio of ways that counts as none: a hood shows that, too
 _NAMED = 3  # frames of a kind, from which on a cause is named
+_JUMPS, _UNEVEN = 2, 2.0  # back and on again; by twice what odometry's ways change
 _STEADY = 0.1  # scatter of the ways' ratio: of wheels that slip it is many times that
 _EXACT = 1e-12 * np.eye(6)  # a covariance that states no error at all
 
@@ -112,7 +114,7 @@ class Witnesses:
         step = frame.odometry
         if step is None or not step.measured or not self._follows_images:
             return False
-        if self._other is not None or tracking.status is EgoMotionStatus.CAPPED:
+        if self._other or self._jumping() or tracking.status is EgoMotionStatus.CAPPED:
             return True
         return self._squared(step, frame.prediction, tracking) > _GATE
 
@@ -145,8 +147,11 @@ class Witnesses:
         free = found.status is EgoMotionStatus.CAPPED
         images = self._of_images(frame, tracked) if free else tracked
         far = found.status.measured and self._contradicted(frame, images)
+        jumps = self._jumping()
         if not far and here is None:
             self._agreeing += 1
+            if jumps:  # by chance: of which moment it is, nothing shows
+                return Judged(self._blind(frame, tracked, frame.prediction), "odometry", step)
             return agreed
         if here is None and self._agreeing >= _ENDS:
             self.score.append(0.0)  # an episode begins
@@ -156,7 +161,7 @@ class Witnesses:
             images = self._of_images(frame, tracked)
         chain = self._chain(frame)
         odometry = self._of_odometry(frame, images, chain)
-        self._weigh(odometry, far, body)
+        self._weigh(odometry, far, body, jumps)
         score = self.score[-1]
         verdict: Verdict = "undecided"
         if abs(score) > _DECIDED:
@@ -165,6 +170,8 @@ class Witnesses:
         if far:
             self._record(frame, images.ego_motion, odometry, verdict)
         if verdict == "odometry":
+            if jumps:
+                odometry = odometry._replace(repeats=True, aliased=False)
             if not odometry.repeats:
                 self._remember(frame.features.descriptors[odometry.features])
             odometry = odometry._replace(tracked=_beginning_none(odometry.tracked, body))
@@ -356,7 +363,7 @@ class Witnesses:
         self._body = np.concatenate([self._body[old], descriptors])
         self._seen = np.concatenate([self._seen[old], np.full(len(descriptors), self._rows)])
 
-    def _weigh(self, odometry: Odometrys, far: bool, body: IntArray) -> None:
+    def _weigh(self, odometry: Odometrys, far: bool, body: IntArray, jumps: bool) -> None:
         """Adds a frame's evidence to the score, each kind no more than its cap."""
         fits, of = len(odometry.ids), odometry.against
         proven = self._proofs.proven
@@ -372,14 +379,22 @@ class Witnesses:
         if far:
             total -= min(max(self._steady(), 0.0), _CAP)
         score = min(max(self.score[-1] + total, -_MOST), _MOST)
-        self.score[-1] = _MOST if odometry.rejoined else score
+        self.score[-1] = _MOST if odometry.rejoined or jumps else score
+
+    def _jumping(self) -> bool:
+        """Whether images jump to and fro in this episode, which has not ended."""
+        return self._agreeing < _ENDS and to_and_fro(self._lately())
+
+    def _lately(self) -> list[Contradiction]:
+        """The last contradicted frames of this episode."""
+        return [one for one in self.found if one.episode == len(self.score) - 1][-_RATIOS:]
 
     def _steady(self) -> float:
         """Evidence that odometry errs by a factor: its way is a fixed share of the images'.
 
         Against what passes with a constant velocity: then the difference of both is fixed.
         """
-        lately = [one for one in self.found if one.episode == len(self.score) - 1][-_RATIOS:]
+        lately = self._lately()
         if len(lately) < _FEWEST_RATIOS:
             return 0.0
         seen = np.array([one.by_images for one in lately])
@@ -420,10 +435,8 @@ class Witnesses:
         """The frame as odometry has it; landmarks begun since the pose left its chain end."""
         other, self._other = self._other, None
         tracked, step = odometry.tracked, frame.step
-        if odometry.repeats and not odometry.aliased:  # images have no say, and begin nothing
-            alone = self._tracker.track_blind(chain, EgoMotionStatus.TOO_FEW_MATCHES)
-            none, had = np.empty(0, np.int64), np.ones(len(frame.features), np.bool_)
-            tracked = Tracked(tracked.expected, MapMatches(none, none, had), alone)
+        if odometry.repeats and not odometry.aliased:
+            tracked = self._blind(frame, tracked, chain)
         if other is None:
             return Judged(tracked, "odometry", step)
         begun = min(one.first_new for one in self.apart if one.episode == other.episode)
@@ -431,6 +444,12 @@ class Witnesses:
         before = frame.prediction.wTc @ inverse(step.motion)
         step = Odometry(inverse(before) @ chain.wTc, chain.covariance)
         return Judged(_without(tracked, begun), "odometry", step, ids[ids >= begun])
+
+    def _blind(self, frame: Frame, tracked: Tracked, chain: Prediction) -> Tracked:
+        """The frame by odometry alone: its images have no say, and begin nothing."""
+        alone = self._tracker.track_blind(chain, EgoMotionStatus.TOO_FEW_MATCHES)
+        none, had = np.empty(0, np.int64), np.ones(len(frame.features), np.bool_)
+        return Tracked(tracked.expected, MapMatches(none, none, had), alone)
 
     def _go_on(self, frame: Frame, wTc: FloatArray, chain: Prediction) -> None:
         """Odometry's chain next to a frame that follows the images."""
@@ -509,9 +528,12 @@ class Witnesses:
 
     def remarks(self) -> tuple[Remark, ...]:
         """The causes, as far as the drive shows them."""
-        by: dict[Verdict, list[Contradiction]] = {"images": [], "odometry": [], "undecided": []}
-        for one in self.found:
-            by[self._decided(one)].append(one)
+        by = defaultdict[str, list[Contradiction]](list)
+        for episode in range(len(self.score)):
+            frames = [one for one in self.found if one.episode == episode]
+            jumps = to_and_fro(frames)
+            for one in frames:
+                by["jumps" if jumps else self._decided(one)].append(one)
         repeats = [one for one in by["odometry"] if one.repeats]
         bodies = [one for one in by["odometry"] if not one.repeats]
         named: tuple[tuple[list[Contradiction], _Cause], ...] = (
@@ -519,12 +541,22 @@ class Witnesses:
             (repeats, ("scene_repeats", {})),
             (bodies, _body_moves(bodies)),
             (by["undecided"], ("witnesses_undecided", {})),
+            (by["jumps"], ("images_out_of_order", {})),
         )
         return tuple(
             Remark(code, tuple(one.number for one in frames), values)
             for frames, (code, values) in named
             if len(frames) >= _NAMED
         )
+
+
+def to_and_fro(frames: Sequence[Contradiction]) -> bool:
+    """Whether images jump to and fro, twice at least, while odometry goes on evenly."""
+    ways = [(one.by_images, one.by_odometry) for one in frames if not one.repeats]
+    seen, given = np.array(ways).reshape(-1, 2, 3).swapaxes(0, 1)
+    off, uneven = seen - given, np.linalg.norm(np.diff([seen, given], axis=1), axis=2)
+    back = (off[1:] * off[:-1]).sum(axis=1) < 0.0
+    return int((back & (uneven[0] > _UNEVEN * uneven[1])).sum()) >= _JUMPS
 
 
 def has_moved(step: Odometry | None) -> bool:

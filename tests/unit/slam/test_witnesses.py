@@ -98,6 +98,27 @@ def test_odometry_that_errs_is_named_and_does_no_harm(
         assert located(session.recorder, session.pipeline.tracker.parts).enough
 
 
+@pytest.mark.parametrize("order", [{6: 7, 7: 6}, {5: 6, 6: 7, 7: 5, 8: 9, 9: 10, 10: 8}])
+def test_images_out_of_order_are_named_and_do_no_harm(order: dict[int, int]) -> None:
+    """They jump to and fro, while odometry goes on evenly."""
+
+    def shown(k: int) -> float:
+        return way(order.get(k, k))
+
+    with driven(lambda k, _: way(k) - way(k - 1), moved=shown) as session:
+        found = session.result()
+        assert codes(found) == ["images_out_of_order"]
+        (note,) = (one for one in found.notes if not isinstance(one, str))
+        assert set(note.frames) <= set(range(min(order), max(order) + 2))
+        assert error_m(found) < 0.02
+
+
+def test_odometry_that_jumps_to_and_fro_is_no_fault_of_the_images() -> None:
+    with driven(lambda k, step: step + (k >= BEGINS) * (0.3 if k % 2 else -0.1)) as session:
+        assert codes(session.result()) == ["odometry_slips"]
+        assert error_m(session.result()) < 0.02
+
+
 def test_odometry_that_errs_does_not_narrow_where_the_next_frame_is_looked_for() -> None:
     """A frame of few matches, held to such a prediction, would seem to agree with it."""
     exact = Odometry(np.eye(4), np.zeros((6, 6)))
