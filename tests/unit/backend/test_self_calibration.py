@@ -320,6 +320,12 @@ def test_noise_that_is_larger_than_stated_widens_the_covariance() -> None:
     assert 1.1 < np.median(wider) < 2.5  # the prior holds some terms in both
 
 
+def sigma_in_the_middle(found: RigCorrection) -> float:
+    """Of the disparity offset of a point in the middle of both images, pixels."""
+    middle = np.broadcast_to([RIG.cx, RIG.cy], (1, RIG.cameras, 2))
+    return float(found.at(middle)[1][0, 2])
+
+
 def offset_sigma(seen: str) -> float:
     """Of the offset in the middle, where rows are known, or all but an offset of all columns."""
     column, row = np.meshgrid(np.linspace(0, RIG.width - 1, 9), np.linspace(0, RIG.height - 1, 9))
@@ -327,7 +333,7 @@ def offset_sigma(seen: str) -> float:
     of_columns, of_rows = displacements(RIG, grid)[:, 2], displacements(RIG, grid)[:, 3]
     known = of_rows if seen == "rows" else np.vstack([of_rows, of_columns - of_columns.mean(0)])
     covariance = np.linalg.inv(prior_information(RIG) + 1e8 * known.T @ known)
-    return RigCorrection(RIG, np.zeros(len(covariance)), covariance).centre_px()[1]
+    return sigma_in_the_middle(RigCorrection(RIG, np.zeros(len(covariance)), covariance))
 
 
 @pytest.mark.parametrize(
@@ -342,9 +348,9 @@ def test_a_rig_that_does_not_move_learns_no_disparity_offset(turn_rad: float, se
     standing = calibrated(road, errors(), 4).found.estimated
     driving = calibrated(Road(), errors(), 4).found.estimated
     left = offset_sigma(seen)
-    assert left > 0.25 * RigCorrection.none(RIG).centre_px()[1]
-    assert standing.centre_px()[1] > 0.6 * left
-    assert driving.centre_px()[1] < 0.35 * left
+    assert left > 0.25 * sigma_in_the_middle(RigCorrection.none(RIG))
+    assert sigma_in_the_middle(standing) > 0.6 * left
+    assert sigma_in_the_middle(driving) < 0.35 * left
 
 
 def test_frames_without_landmarks_teach_nothing() -> None:
