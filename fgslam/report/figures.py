@@ -119,6 +119,11 @@ def dots(
     return scatter(name, points, **(usual | more))
 
 
+def to_millimetre(lengths: FloatArray) -> FloatArray:
+    """Lengths in metres to 2^-10 of it: bits below, which no eye sees, cannot be packed."""
+    return np.asarray(np.rint(lengths * 1024.0) / 1024.0)
+
+
 def curve(name: str, x: FloatArray, y: FloatArray, colour: str, **more: Any) -> go.Scatter:
     """A line over a common axis, its value shown at the pointer."""
     hover = {"hoverinfo": None, "hovertemplate": "%{y:.4g}"}
@@ -300,7 +305,7 @@ def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
         outside = max(outside, int((~inside).sum()))
         # Plotly would draw what lies outside the axes across the page.
         rows = thinned(len(points), detail.dots_map)
-        points = points[rows[inside[rows]]]
+        points = to_millimetre(points[rows[inside[rows]]])
         traces.append(
             dots(
                 f"landmarks of {estimator.title}",
@@ -451,7 +456,8 @@ def _landmarks_above(data: ReportData, level: FloatArray, detail: Detail) -> Ite
             flat = in_plane(landmarks.covariances[rows], level[:2])
             around = outlines(landmarks.positions[rows] @ level[:2].T, flat)
             yield line(LANDMARK_ELLIPSES, around, GREY, 0.6, shown=False)
-        points = landmarks.positions[thinned(len(landmarks), detail.dots_above)] @ level.T
+        rows = thinned(len(landmarks), detail.dots_above)
+        points = to_millimetre(landmarks.positions[rows] @ level.T)
         style: dict[str, Any] = {"hoverinfo": "skip", "hovertemplate": None}
         if alone and len(points):
             points = points[np.argsort(points[:, 2], kind="stable")]  # as seen from above

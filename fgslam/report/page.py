@@ -18,6 +18,8 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from fgslam.core.files import write_text
 from fgslam.report import figures as drawn
 from fgslam.report.content import Drive, Page, Picture, metres, plain
@@ -106,10 +108,16 @@ def _plotly() -> tuple[str, str]:
 
 
 def _packed(text: str) -> str:
-    """Text as gzip in base64, without a date, so that equal texts give equal bytes."""
-    # Level 9 takes twice the time for a twenty-fifth fewer bytes.
-    content = gzip.compress(text.encode("utf-8"), compresslevel=4, mtime=0)
-    return base64.b64encode(content).decode("ascii")
+    """Text as gzip, seven bits a character, without a date, so that equal texts give equal bytes.
+
+    An eighth shorter than base64. What a browser's parser does not hand on as it is has a bit more,
+    which `draw.js` cuts off.
+    """
+    content = gzip.compress(text.encode("utf-8"), compresslevel=6, mtime=0)
+    bits = np.unpackbits(np.frombuffer(content, np.uint8))
+    groups = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
+    codes = np.packbits(groups, axis=1) >> 1
+    return codes.tobytes().decode("ascii").translate({ord(c): 0x100 + ord(c) for c in "\0\r<"})
 
 
 def _digest(script: str) -> str:

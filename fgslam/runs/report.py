@@ -331,7 +331,7 @@ def report_from_folder(
     Raises:
         FgslamError: there are no results, one of the files is damaged, or writing failed.
     """
-    data = load_report(folder, run)
+    data = load_report(folder, run, page)
     if plan:
         draw_plan(make_subfolder(folder, PICTURES) / "map_from_above.png", data)
     if page:
@@ -376,8 +376,11 @@ def draw_run(run: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*.png") if path.stem in _FIGURES_OF_THE_PAGE)
 
 
-def load_report(folder: Path, run: Path | None = None) -> ReportData:
-    """All that the page of a folder shows; arguments and errors as :func:`report_from_folder`."""
+def load_report(folder: Path, run: Path | None = None, page: bool = False) -> ReportData:
+    """What a folder holds; arguments and errors as :func:`report_from_folder`.
+
+    The cost of a frame and the small views are read for a page alone.
+    """
     if run is None and not (folder / LOG_FILE).is_file():
         above = folder.resolve().parent
         run = above if (above / RUN_MARKER).is_file() else None
@@ -446,10 +449,10 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         up=_up(find(LOG_FILE)),
         alarms=alarms(found, (steered or {}).get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
-        stages=None if (file := find("timing.csv")) is None else _stages(file),
+        stages=_stages(file) if page and (file := find("timing.csv")) else None,
         views={
             int(path.stem.rpartition("_")[2]): path.read_bytes()
-            for path in pictures.glob(f"{VIEW}_*.jpg")
+            for path in (pictures.glob(f"{VIEW}_*.jpg") if page else ())
         },
         about=tuple((one.title, _kind_in_words(one.kind)) for one in estimators),
         commands=next_commands(folder.resolve().name) if find(LOG_FILE) else (),

@@ -29,7 +29,7 @@ DEMO_SHORT = (
 )
 
 
-LARGEST_PAGE = 3_000_000
+LARGEST_PAGE = 2_500_000
 """Bytes of the demo's page: with its pictures, Plotly and the data of all figures."""
 
 

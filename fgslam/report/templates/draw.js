@@ -1,7 +1,13 @@
 "use strict";
 (async () => {
   const unpacked = async (id) => {
-    const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+    const text = document.getElementById(id).textContent; // seven bits a character
+    const bytes = new Uint8Array((text.length * 7) >> 3);
+    for (let k = 0, held = 0, count = 0, at = 0; k < text.length; k++) {
+      held = ((held << 7) | (text.charCodeAt(k) & 127)) & 0x7fff;
+      count += 7;
+      if (count >= 8) bytes[at++] = held >> (count -= 8);
+    }
     return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
   };
   const plotly = document.createElement("script");

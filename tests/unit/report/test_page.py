@@ -63,7 +63,8 @@ def render(data: ReportData) -> str:
 
 def text_of(script: str) -> str:
     """Text of a compressed element."""
-    return gzip.decompress(base64.b64decode(script)).decode("utf-8")
+    bits = "".join(f"{ord(character) & 127:07b}" for character in script)
+    return gzip.decompress(int(bits[: len(bits) // 8 * 8], 2).to_bytes(len(bits) // 8)).decode()
 
 
 # --------------------------------------------------------------------------------------------
