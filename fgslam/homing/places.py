@@ -23,21 +23,30 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
+from fgslam.frontend.homing.vector import vector_between
 from fgslam.homing.active import CONTRADICTION_DEG, parallax
 from fgslam.homing.features import compacted
 from fgslam.homing.front_end import compare_views
-from fgslam.homing.links import Answer, VisualWords
-from fgslam.homing.route import MetricPoses, PathMemory
+from fgslam.homing.links import Answer, VisualWords, between_misfit
+from fgslam.homing.route import MetricPoses, PathMemory, is_near
 from fgslam.homing.settings import FrontEndSettings, LocalisationSettings
 from fgslam.homing.steering import SURE, MetricPlace, PathPlace
 
-LIKELY = 0.5  # below this there is no homing vector either
-_CANDIDATES = 6  # path images that an image is matched with, half of them because they look alike
 _ALL = 60  # so many path images at most are all tried while the place is not known
 _OTHERS = 3  # path images elsewhere that tell how many matches a wrong place has
-_AHEAD, _BACK = 0.4, 0.1  # chances to be at the path image after or before by the next image
+_STEP_PRIOR = 3.0 * np.array([0.1, 0.5, 0.4])
+"""Chances to be at the path image before, at the same or at the one after by the next image, as if
+seen in so many steps."""
+_KEPT = 0.9  # of what earlier steps tell of the next one: of some ten
+_AGAIN = 8  # path images at most that are looked at again by all candidate matches
+_EVEN = 0.5  # chance that a vector is wrong which all candidate matches do not tell from others
+_CANDIDATES_EACH = 2.5  # inliers of all candidates over those of matches, on a school floor
+_ALIKE = 0.02
+"""Chance that a place looks like another one of the path: a corridor built twice. As of a leap."""
+
 _ON_ROUTE = 0.5  # that images are of the route at all, before the first and when carried off
 _LEAVING = 0.02  # chance to have left the route, or to have come upon it, since the last image
+_MISSED = 0.25  # chance that an image on the route has no homing vector to the nearest path image
 
 _ELSEWHERE = 12.0
 """Evidence, in inliers, that the best of a route's images may get from another place: what the
@@ -57,6 +66,7 @@ _REACHED, _BESIDE = 0.07, 0.25
 """Parts of the last leg: along it, as `SWITCH_FRACTION` of the controller, and in all."""
 
 _CONTRADICTION = np.deg2rad(CONTRADICTION_DEG)
+_TRIANGLE = np.deg2rad(10.0)  # of a robot and two path images; as of links of a map
 _AGREEING = 3  # images in a row that agree, until what contradicts those before is believed
 _SIGMAS = 4.0  # between two homing vectors of which one must be wrong
 _STREAM = 9  # of the seed's random numbers
@@ -69,6 +79,8 @@ class _Aim:
     Attributes:
         target: its number.
         across: direction of the robot's way in the target's axes, radians; NaN before it is known.
+        heading: its heading minus the robot's, radians; NaN where its turns are not known. A vector
+            that is wrong by half a turn has the right way across.
         doubted: one that contradicted it, and must be seen again.
         agreeing: images in a row that saw it.
         widest: largest parallax so far, radians.
@@ -80,6 +92,7 @@ class _Aim:
 
     target: int
     across: float = float("nan")
+    heading: float = float("nan")
     doubted: float = float("nan")
     agreeing: int = 0
     widest: float = 0.0
@@ -103,13 +116,17 @@ class PathPlaces:
         self._path, self._settings = path, settings
         self._rng = np.random.default_rng((seed, _STREAM))
         self._parallax: dict[int, float] = {}
-        self._matches: dict[int, int] = {}
+        self._matches: dict[int, BearingMatches] = {}
+        self._shown: dict[int, IntArray] = {}
+        self._twice, self._repeated = set[int](), set[int]()
+        self._steps = _STEP_PRIOR
+        self._spoke = set[int]()
         self._probability, self._on_route = 0.0, _ON_ROUTE
-        localisation = LocalisationSettings(candidates=_CANDIDATES)
+        localisation = LocalisationSettings()
         self._continuity = Continuity(localisation.leap)
         self._before: OmniFeatures | None = None
         self._localiser = Localiser(
-            _forward(len(path)),
+            _along(len(path), _STEP_PRIOR),
             VisualWords(path.images, self._rng),
             self._link,
             localisation,
@@ -117,7 +134,7 @@ class PathPlaces:
             _POWER,
         )
         self._aim: _Aim | None = None
-        self._last_leg: tuple[float, float] | None = None
+        self._legs: dict[int, tuple[Answer, BearingMatches]] = {}
 
     @property
     def belief(self) -> FloatArray:
@@ -127,25 +144,27 @@ class PathPlaces:
     def look(self, features: OmniFeatures) -> PathPlace:
         """The place of one more image."""
         self._parallax, self._matches = {}, {}
+        self._before_shown, self._shown = self._shown, {}
         off = self._localiser.leap = self._carried_off(features)
-        if off > LIKELY:
+        if off > _OFF:
             self._probability, self._aim = 0.0, None
         lost = self._probability < SURE
         every = range(len(self._path))
         wanted = every if lost and len(every) <= _ALL else self._wanted()
-        expected = self._localiser.expected()
+        before, expected = self._localiser.belief, self._localiser.expected()
         belief = self._localiser.update(features, wanted)
+        self._learn_steps(before)
         self._on_route = self._still_on_route(off, float(expected @ self._on_route_evidence()))
         nearest = int(np.argmax(belief))
         near = slice(max(nearest - 1, 0), nearest + 2)
         believed = self._on_route * float(belief[near].sum())
         probability = self._probability = believed * self._spoken_for(near)
-        if believed < LIKELY:
+        if probability < SURE:
             refusal = f"place not known: {100.0 * probability:.0f} % at {self._path.names[nearest]}"
             return PathPlace(nearest, probability, nearest, None, refusal, 1.0, False)
         aim = self._aimed(nearest)
         reached = self._reached(aim, nearest)
-        vector, refusal = self._vector(aim)
+        vector, refusal = self._vector(aim, nearest, features)
         metric = metric_place(self._path.metric, aim.target, self._left(aim.target))
         remaining = self._remaining(aim)
         return PathPlace(
@@ -154,15 +173,51 @@ class PathPlaces:
 
     # ----------------------------------------------------------------------------------------
 
-    def _link(self, image: OmniFeatures, node: int) -> Answer:
-        answer, matches = compare_views(image, self._path.images[node], self._settings, self._rng)
-        self._matches[node] = len(matches)
+    def _link(self, image: OmniFeatures, nodes: Sequence[int]) -> dict[int, Answer]:
+        """Homing vectors to path images; where none is clear, by all candidate matches."""
+        found = dict[int, Answer]()
+        for k in nodes:
+            target = self._path.images[k]
+            answer, self._matches[k] = compare_views(image, target, self._settings, self._rng)
+            found[k] = self._seen(k, answer, self._matches[k])
+        self._twice, self._repeated = set(), set()
+        if not any(map(_is_clear, found.values())):
+            best = sorted(nodes, key=lambda k: (inliers_of(found)[k], len(self._matches[k])))
+            self._twice = {*best[-_AGAIN:], *self._wanted()} & found.keys()
+        return found | {k: self._looked_again(image, k, found[k]) for k in sorted(self._twice)}
+
+    def _looked_again(self, image: OmniFeatures, node: int, first: Answer) -> Answer:
+        """By all candidate matches; what the first look alone sees may as well be another one."""
+        s, target = self._settings, self._path.images[node]
+        matching, rng = s.features.matching, self._rng
+        answer, matches = vector_between(image, target, matching, s.homing_vector, rng)
+        if answer:
+            return self._seen(node, answer, matches)
+        if answer.reason is RefusalReason.AMBIGUOUS and not is_near(answer, self._matches[node]):
+            self._repeated.add(node)
+        return (
+            replace(first, wrong_probability=_EVEN) if first else self._seen(node, answer, matches)
+        )
+
+    def _seen(self, node: int, answer: Answer, matches: BearingMatches) -> Answer:
+        """The answer, whose parallax is kept."""
         if isinstance(answer, TwoViewVector):
             inliers = matches.select(answer.inliers)
             self._parallax[node] = parallax(inliers, answer.rotation)
+            self._shown[node] = 2 * inliers.index_b + inliers.kind
         elif answer.reason is RefusalReason.AT_TARGET:
             self._parallax[node] = 0.0
         return answer
+
+    def _learn_steps(self, before: FloatArray) -> None:
+        """How the robot goes along the path, by what its last steps seem to have been."""
+        here, leap = self._localiser.likelihood, self._localiser.leap
+        here = (here / here.max()) ** _POWER
+        each = np.array([before[1:] @ here[:-1], before @ here, before[:-1] @ here[1:]])
+        each *= (1.0 - leap) * self._steps / self._steps.sum()
+        found = each / (each.sum() + leap * here.mean())
+        self._steps = _STEP_PRIOR + _KEPT * (self._steps - _STEP_PRIOR) + found
+        self._localiser.transition = _along(len(before), self._steps)
 
     def _wanted(self) -> list[int]:
         """Path images that are matched in any case: the one aimed at and its neighbours."""
@@ -177,6 +232,8 @@ class PathPlaces:
         if before is None:
             return self._continuity.chance
         answer, matches = compare_views(before, self._before, self._settings, self._rng)
+        if self._aim is not None:
+            self._aim.heading -= np.nan if answer.rotation is None else answer.rotation
         most = min(len(one.sift) + len(one.columns) for one in (before, self._before))
         return self._continuity.carried_off(in_common(answer, matches), most)
 
@@ -185,43 +242,70 @@ class PathPlaces:
 
         What is believed from the images before is not to be stated against the present one. It
         counts by the place's share of its own evidence and that of the better one: half at most.
+        Half counts, too, what no homing vector speaks for, or one path image alone in this image
+        and the last while the place was not known: a corridor may be built twice.
         """
+        spoke, answers = self._spoke, self._localiser.answers.items()
+        self._spoke = {k for k, a in answers if a or is_near(a, self._matches[k])}
+        within = set(range(*near.indices(len(self._path))))
+        least = 1 if self._probability >= SURE else 2
+        if not self._spoke & within or len((self._spoke | spoke) & within) < least:
+            return 0.5
         here = float(self._localiser.likelihood[near].max())
         best = float(self._localiser.likelihood.max())
         return 1.0 if here >= best else here / (here + best)
+
+    def _alike(self, best: int) -> float:
+        """Chance that an image shows the like of a path image, and not its place.
+
+        It is that of the things seen: as far as the last image saw the same ones there, this one is
+        no other witness of the place.
+        """
+        if best not in self._shown:
+            return _ALIKE
+        before = self._before_shown.get(best, np.zeros(0))
+        return float(_ALIKE ** np.mean(~np.isin(self._shown[best], before)))
 
     def _still_on_route(self, off: float, likelihood: float) -> float:
         """Probability that the image was taken on the route at all.
 
         Args:
             off: that the robot was carried off since the last one.
-            likelihood: of the image if it was; elsewhere it would be ``_ELSEWHERE``.
+            likelihood: of the image if it was, over that elsewhere.
         """
         on = self._on_route
         on = on * (1.0 - _LEAVING) + (1.0 - on) * _LEAVING
         on = on * (1.0 - off) + _ON_ROUTE * off
-        return on * likelihood / (on * likelihood + (1.0 - on) * _ELSEWHERE)
+        return on * likelihood / (on * likelihood + 1.0 - on)
 
     def _on_route_evidence(self) -> FloatArray:
-        """(n,) of each path image that the image was taken on the route: inliers above all."""
+        """(n,) how much likelier the image is at each path image than elsewhere: by inliers."""
         evidence = self._localiser.likelihood.copy()
         for k, answer in self._localiser.answers.items():
-            if not answer and answer.reason is not RefusalReason.AT_TARGET:
+            at_target = not answer and answer.reason is RefusalReason.AT_TARGET
+            if (not answer or k in self._repeated) and not at_target:
                 evidence[k] = min(evidence[k], _ELSEWHERE)
-        return evidence
+        return np.asarray(np.maximum((evidence / _ELSEWHERE) ** _POWER, _MISSED))
 
     def _weighed(self, answers: Mapping[int, Answer]) -> dict[int, float]:
         """Inliers of path images, and by how much their matches exceed those of wrong places.
 
         In dim light the right place often has too few inliers for a homing vector, but more
-        matches than the wrong ones.
+        matches than the wrong ones. Not so where several motions fit: lockers, one like the other.
         """
         inliers = inliers_of(answers)
-        counts = {k: self._matches[k] for k in answers}
+        inliers |= {
+            k: inliers[k] / _CANDIDATES_EACH for k in self._twice if not _is_even(answers[k])
+        }
+        inliers |= dict.fromkeys(self._repeated, 0.0)
+        counts = {k: len(self._matches[k]) for k in answers}
         best = max(counts, key=lambda k: (inliers[k], counts[k]))
         others = [count for k, count in counts.items() if abs(k - best) > 1]
         usual = _most_by_chance(others) if len(others) >= _OTHERS else max(counts.values())
-        return {k: inliers[k] + max(counts[k] - usual, 0.0) for k in answers}
+        found = {k: inliers[k] + max(counts[k] - usual, 0.0) for k in answers}
+        found |= dict.fromkeys(self._repeated, 0.0)
+        self._localiser.alike = self._alike(max(found, key=found.__getitem__))
+        return found
 
     def _aimed(self, nearest: int) -> _Aim:
         """The path image to go to: the nearest one or, once that is passed, the one after it."""
@@ -233,9 +317,11 @@ class PathPlaces:
         return self._aim
 
     def _elsewhere(self, aim: _Aim, nearest: int) -> bool:
-        """Whether the target lies behind, or images in a row agree that it is not near."""
+        """Whether the target lies behind, or far off: unclear, or as images in a row agree."""
         aim.elsewhere = aim.elsewhere + 1 if aim.target > nearest + 1 else 0
-        return aim.target < nearest or aim.elsewhere >= _AGREEING
+        seen = self._localiser.answers.get(aim.target)
+        unclear = aim.elsewhere > 0 and not (seen and _is_clear(seen))
+        return aim.target < nearest or unclear or aim.elsewhere >= _AGREEING
 
     def _passed(self, aim: _Aim) -> bool:
         """Whether the path image lies behind, as seen from the robot's way to the one after it.
@@ -254,9 +340,10 @@ class PathPlaces:
             return False
         return here < _NEAR * ahead or self._apart(k, k + 1) > np.pi / 2
 
-    def _confirmed(self, aim: _Aim, across: float, limit: float) -> bool:
+    def _confirmed(self, aim: _Aim, vector: TwoViewVector) -> bool:
         """Whether enough images in a row agree on what contradicts those before."""
-        aim.agreeing = aim.agreeing + 1 if _away(across, aim.doubted) <= limit else 1
+        across = _across(vector)
+        aim.agreeing = aim.agreeing + 1 if _away(across, aim.doubted) <= _limit(vector) else 1
         aim.doubted = across
         return aim.agreeing >= _AGREEING
 
@@ -297,10 +384,7 @@ class PathPlaces:
         """Distance of the path's end, and the part of it along the last leg; in legs."""
         last = len(self._path) - 1
         seen, answer = self._parallax[last], self._localiser.answers[last]
-        if last > 0 and self._last_leg is None:
-            ends = self._path.images[last - 1], self._path.images[last]
-            self._last_leg = _leg_of(*compare_views(*ends, self._settings, self._rng))
-        across, length = self._last_leg or (float("nan"), float("nan"))
+        across, length = _leg_of(*self._leg(last - 1)) if last else (float("nan"), float("nan"))
         if not np.isfinite(length):
             length = max(self._parallax.get(last - 1, 0.0), aim.widest, 1e-9)
         far = seen / length
@@ -308,37 +392,97 @@ class PathPlaces:
             return far, far
         return far, far * float(np.cos(_across(answer) - across))
 
-    def _vector(self, aim: _Aim) -> tuple[TwoViewVector | None, str]:
+    def _vector(
+        self, aim: _Aim, nearest: int, features: OmniFeatures
+    ) -> tuple[TwoViewVector | None, str]:
         """The homing vector to the target, unless it contradicts those before it for once.
 
         At little parallax, or with a camera that is tilted, another direction may fit nearly as
-        well. Where earlier images tell which is right that does no harm; the first vector to a
-        target must be clear by itself, or be seen alike in several images.
+        well. Where earlier images tell which is right that does no harm; else all candidate
+        matches must tell, or it be seen alike in several images.
         """
         answer = self._localiser.answers.get(aim.target)
         if answer is None:
             return None, "not matched"
-        if isinstance(answer, Refusal):
-            return None, answer.details
-        aim.widest = max(aim.widest, self._parallax[aim.target])
-        across = _across(answer)
-        sigma = float(np.sqrt(answer.covariance[0, 0] + answer.covariance[1, 1]))
-        limit = max(_CONTRADICTION, _SIGMAS * sigma)
-        first = not np.isfinite(aim.across)
-        open_ = (
-            answer.wrong_probability > 1.0 - SURE if first else _away(across, aim.across) > limit
+        vector = answer if isinstance(answer, TwoViewVector) else None
+        why = self._open(aim, answer)
+        if why:
+            twice = aim.target in self._twice
+            again = answer if twice else self._looked_again(features, aim.target, answer)
+            if isinstance(again, TwoViewVector) and not _is_even(again):
+                vector = again
+            elif vector is not None and not self._confirmed(aim, vector):
+                vector = None
+        if vector is None:
+            return None, why
+        unclear = aim.target != nearest and (
+            why or aim.target > nearest + 1 or aim.target in self._twice
         )
-        if open_ and not self._confirmed(aim, across, limit):
-            why = "fits another direction nearly as well" if first else "contradicts those before"
-            return None, f"{why}, needs other images that agree"
-        aim.across, aim.agreeing = across, 0
-        return answer, ""
+        if unclear and not self._confirmed_by_path(aim.target, vector):
+            return None, "is not confirmed by the path images before and after"
+        aim.widest = max(aim.widest, self._parallax.get(aim.target, 0.0))
+        aim.across, aim.heading, aim.agreeing = _across(vector), vector.rotation, 0
+        return vector, ""
+
+    def _confirmed_by_path(self, target: int, vector: TwoViewVector) -> bool:
+        """Whether target, robot and a path image next to it make a triangle as taught.
+
+        One is enough: of the other the vector to that path image may be wrong.
+        """
+        for begin in (target - 1, target):
+            seen = self._localiser.answers.get(2 * begin + 1 - target)
+            leg = self._leg(begin)[0] if seen and not _is_even(seen) else None
+            if seen and leg:
+                first, whole = (vector, seen) if begin == target else (seen, vector)
+                turned = _away(whole.rotation, first.rotation + leg.rotation)
+                onwards = leg.direction + first.rotation
+                aside = between_misfit(first.direction, onwards, whole.direction)
+                # Of a way back the third side may have any direction: it confirms nothing.
+                shows = _away(onwards, first.direction) < np.pi - _TRIANGLE
+                if shows and max(turned, aside) <= _limit(vector, seen, leg, least=_TRIANGLE):
+                    return True
+        return False
+
+    def _leg(self, begin: int) -> tuple[Answer, BearingMatches]:
+        """Of a path image to the one after it."""
+        if begin not in self._legs:
+            first, second = self._path.images[begin : begin + 2]
+            self._legs[begin] = compare_views(first, second, self._settings, self._rng)
+        return self._legs[begin]
+
+    def _open(self, aim: _Aim, answer: Answer) -> str:
+        """Why a homing vector to the target is not to be trusted by itself; empty if it is."""
+        if isinstance(answer, Refusal):
+            return answer.details
+        if np.isfinite(aim.across):
+            off = (_away(_across(answer), aim.across), _away(answer.rotation, aim.heading))
+            contradicts = any(angle > _limit(answer) for angle in off)
+            return "contradicts those before, needs other images that agree" if contradicts else ""
+        if answer.wrong_probability > 1.0 - SURE:
+            return "fits another direction nearly as well, needs other images that agree"
+        return ""
 
 
-def _forward(count: int) -> FloatArray:
-    """(n, n) chances to be at each path image by the next image: staying or going on, mostly."""
-    steps = np.eye(count, k=1) * _AHEAD + np.eye(count, k=-1) * _BACK
-    return np.asarray(steps + np.diag(1.0 - steps.sum(axis=1)))
+def _limit(*vectors: TwoViewVector, least: float = _CONTRADICTION) -> float:
+    """Angle up to which homing vectors may differ from each other and be right, radians."""
+    variance = sum(float(np.trace(vector.covariance)) for vector in vectors)
+    return max(least, _SIGMAS * float(np.sqrt(variance)))
+
+
+def _along(count: int, steps: FloatArray) -> FloatArray:
+    """(n, n) chances to be at each path image by the next image; ``steps`` are in proportion."""
+    back, _, on = steps / steps.sum()
+    moves = np.eye(count, k=1) * on + np.eye(count, k=-1) * back
+    return np.asarray(moves + np.diag(1.0 - moves.sum(axis=1)))
+
+
+def _is_clear(answer: Answer) -> bool:
+    """Whether a vector is so much likelier than any other that a second look shows no more."""
+    return isinstance(answer, TwoViewVector) and answer.wrong_probability <= 1.0 - SURE
+
+
+def _is_even(answer: Answer) -> bool:
+    return isinstance(answer, TwoViewVector) and answer.wrong_probability >= _EVEN
 
 
 def _most_by_chance(counts: Sequence[int]) -> float:
@@ -376,8 +520,8 @@ def _away(one: float, other: float) -> float:
 # anywhere, so that a robot that was carried off finds itself again.
 
 
-Linker: TypeAlias = Callable[[OmniFeatures, int], Answer]
-"""The homing vector from an image's place to that of a node, by its number."""
+Linker: TypeAlias = Callable[[OmniFeatures, Sequence[int]], Mapping[int, Answer]]
+"""The homing vectors from an image's place to those of nodes, by their numbers."""
 
 _BACKGROUND = 4.0  # inliers that a wrong place may get, on average
 
@@ -397,6 +541,8 @@ class Localiser:
         likelihood: (n,) of the last image at each node, up to a factor.
         answers: homing vectors of the last image to those nodes that it was matched with.
         leap: chance to be anywhere at all by the next image; the settings' unless it is set.
+        alike: chance that the last image shows the like of a node elsewhere: no evidence.
+        transition: (n, n) chances to go from row to column between two images, without leaps.
     """
 
     def __init__(
@@ -414,7 +560,7 @@ class Localiser:
             transition: (n, n) chances to go from row to column between two images, without leaps;
                 along links: :func:`transition_along`.
             words: of the map's images, in their order.
-            linker: homing vector from the robot's image to a node's.
+            linker: homing vectors from the robot's image to nodes'.
             settings: chances and the number of nodes to match with.
             weigh: evidence of answers; None: their inliers.
             power: of the likelihood of an image: how much it counts.
@@ -423,9 +569,9 @@ class Localiser:
         self._linker = linker
         self._settings = settings
         self._weigh = weigh or inliers_of
-        self._transition = transition
+        self.transition = transition
         self._power = power
-        self.leap = settings.leap
+        self.leap, self.alike = settings.leap, 0.0
         self.belief: FloatArray = np.full(len(transition), 1.0 / max(len(transition), 1))
         self.answers: dict[int, Answer] = {}
         self.likelihood: FloatArray = np.ones(len(transition))
@@ -444,7 +590,8 @@ class Localiser:
         expected = self.expected()
         self._fresh = False
         self.likelihood = likelihoods(self._supports(image, expected, also), _BACKGROUND)
-        posterior = expected * (self.likelihood / self.likelihood.max()) ** self._power
+        shown = (self.likelihood / self.likelihood.max()) ** self._power
+        posterior = expected * (self.alike + (1.0 - self.alike) * shown)
         self.belief = posterior / posterior.sum()
         return self.belief.copy()
 
@@ -458,7 +605,7 @@ class Localiser:
         return node, float(self.belief[node])
 
     def _moved(self) -> FloatArray:
-        moved = self.belief @ self._transition
+        moved = self.belief @ self.transition
         return (1.0 - self.leap) * moved + self.leap / len(self.belief)
 
     def _supports(
@@ -466,7 +613,7 @@ class Localiser:
     ) -> FloatArray:
         """(n,) evidence of the nodes that are worth a match; 0 for the others."""
         nodes = np.union1d(self._candidates(image, expected), np.array([*also], dtype=np.int64))
-        self.answers = {node: self._linker(image, node) for node in nodes.tolist()}
+        self.answers = dict(self._linker(image, nodes.tolist()))
         out = np.zeros(len(self.belief))
         for node, evidence in self._weigh(self.answers).items():
             out[node] = evidence

@@ -276,12 +276,12 @@ class Teacher:
         vector, matches = compare_views(first.features, view.features, self._settings, rng)
         if isinstance(vector, Refusal):
             row = TaughtImage(view.number, view.name, "", refusal=vector.details)
-            return _Compared(view, row, None, _is_near(vector, matches))
+            return _Compared(view, row, None, is_near(vector, matches))
         inliers = matches.select(vector.inliers)
         return _Compared(view, _row_of(view, vector, inliers), inliers, False)
 
 
-def _is_near(refusal: Refusal, matches: BearingMatches) -> bool:
+def is_near(refusal: Refusal, matches: BearingMatches) -> bool:
     """Whether there is no homing vector because there is no way to speak of, only a turn."""
     if refusal.reason in (RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN):
         turn = circular_median(wrap(matches.bearing_a - matches.bearing_b))

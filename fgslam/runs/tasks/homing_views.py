@@ -300,9 +300,9 @@ def _localise(
     topology = _map_of(config, nodes, found, kept, [names[k] for k in kept])
     rng = np.random.default_rng((config.seed, 1))
 
-    def linker(image: OmniFeatures, node: int) -> TwoViewVector | Refusal:
+    def linker(image: OmniFeatures, which: Sequence[int]) -> dict[int, TwoViewVector | Refusal]:
         matching, vector = config.features.matching, config.homing_vector
-        return vector_between(image, nodes[node], matching, vector, rng)[0]
+        return {k: vector_between(image, nodes[k], matching, vector, rng)[0] for k in which}
 
     moves = transition_along(topology.graph())
     localiser = Localiser(moves, VisualWords(nodes, rng), linker, config.localisation)

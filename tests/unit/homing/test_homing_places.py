@@ -43,12 +43,12 @@ ALONG = ((540, 278, 5, 0, 5, 33), (388, 380, 49, 0, 78, 87), (239, 418, 85, 54, 
 fisheye in the rendered house, on a way that ends in the room where it begins."""
 
 
-def matches_of(count: int) -> BearingMatches:
+def matches_of(count: int, first: int = 0) -> BearingMatches:
     bearing = np.linspace(-3.0, 3.0, count)
     return BearingMatches(
         kind=np.zeros(count, np.int64),
         index_a=np.arange(count),
-        index_b=np.arange(count),
+        index_b=first + np.arange(count),
         bearing_a=bearing,
         elevation_a=0.0 * bearing,
         bearing_b=bearing + 0.1,
@@ -61,19 +61,22 @@ def matches_of(count: int) -> BearingMatches:
 class World:
     """What images show: told by numbers, in place of comparing their features.
 
-    A stand-in for ``compare_views``: it knows images and path images by their identity.
+    A stand-in for ``compare_views``, which knows images and path images by their identity, and for
+    ``vector_between``, which finds no more.
 
     Attributes:
-        direction, doubt: of all homing vectors.
+        direction, rotation, doubt: of all homing vectors; from image to image it turns by 0.1.
+        same: that each image sees the same features of path images; others else.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, some: OmniFeatures) -> None:
         self._some = some
         self.path = PathMemory.of([replace(self._some) for _ in ALONG[0]])
         self._seen: tuple[Sequence[int], Mapping[int, int]] = ((), {})
-        self.direction, self.doubt = 0.3, 0.0
-        self._step = 0
+        self.direction, self.rotation, self.doubt = 0.3, 0.1, 0.0
+        self._step, self._first, self.same = 0, 0, False
         monkeypatch.setattr(path_places, "compare_views", self._compare)
+        monkeypatch.setattr(path_places, "vector_between", self._look_again)
 
     def look(
         self, places: PathPlaces, inliers: Sequence[int], step: int, matched: Sequence[int] = ()
@@ -87,7 +90,16 @@ class World:
             matched: matches without a homing vector at each path image.
         """
         self._seen, self._step = (inliers, dict(enumerate(matched))), step
+        self._first += 0 if self.same else 1000
         return places.look(replace(self._some))
+
+    def _look_again(
+        self, image: OmniFeatures, target: OmniFeatures, *__: object
+    ) -> tuple[TwoViewVector | Refusal, BearingMatches]:
+        answer, matches = self._compare(image, target)
+        if answer and self.doubt:
+            answer = Refusal(RefusalReason.UNCERTAIN, "open")
+        return answer, matches
 
     def _compare(
         self, _: OmniFeatures, target: OmniFeatures, *__: object
@@ -99,8 +111,9 @@ class World:
             count = 0 if node is None else matched.get(node, 0)
             return Refusal(RefusalReason.TOO_FEW_INLIERS, "few"), matches_of(count)
         found = np.ones(common, np.bool_)
-        vector = TwoViewVector(self.direction, 0.1, np.eye(2) * 1e-4, found, 0, self.doubt)
-        return vector, matches_of(common)
+        turn = 0.1 if node is None else self.rotation
+        vector = TwoViewVector(self.direction, turn, np.eye(2) * 1e-4, found, 0, self.doubt)
+        return vector, matches_of(common, self._first)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +162,27 @@ def test_matches_alone_do_not_tell_that_it_is_the_route(world: World) -> None:
         assert place.vector is None
 
 
+def test_one_path_image_alone_makes_no_place_known_but_keeps_it_known(world: World) -> None:
+    """A corridor that is built twice is not alike at two path images one after the other."""
+    lost, places = PathPlaces(world.path, DRIVING), PathPlaces(world.path, DRIVING)
+    assert not any(world.look(lost, [0, 0, 60, 0, 0, 0], 200 if k else 0).sure for k in range(8))
+    for k in range(3):
+        assert not world.look(places, [0, 0, 60, 0, 0, 0], 200 if k else 0).sure
+    assert world.look(places, [0, 0, 40, 60, 0, 0], 200).sure
+    assert world.look(places, [0, 0, 0, 60, 0, 0], 200).sure
+    assert not world.look(places, [0] * 6, 200, matched=[12, 9, 15, 60, 14, 11]).sure
+
+
+def test_the_same_features_again_are_no_further_evidence(world: World) -> None:
+    belief = []
+    for world.same in (False, True):
+        places = PathPlaces(world.path, DRIVING)
+        for row in ([90, 70, 0, 0, 0, 0], [90, 70, 0, 0, 0, 0], *[[0, 0, 0, 0, 60, 0]] * 2):
+            world.look(places, row, 200)
+        belief.append(places.belief[4])
+    assert belief[1] < 0.5 * belief[0]
+
+
 def test_on_the_route_matches_tell_the_place_between_homing_vectors(world: World) -> None:
     places = PathPlaces(world.path, DRIVING)
     world.look(places, ALONG[3], 0)
@@ -169,6 +203,16 @@ def test_the_first_direction_to_a_path_image_must_be_clear_or_be_seen_again(worl
         place = world.look(open_, ALONG[3], 200)
         given.append(place.vector is not None)
     assert given == [False, False, False, True, True]
+
+
+def test_a_direction_that_is_wrong_by_half_a_turn_is_seen_by_the_turns_before(world: World) -> None:
+    """Its way in the target's axes is right; the robot turned by 0.1 from image to image."""
+    places, world.rotation = PathPlaces(world.path, DRIVING), 0.1
+    assert world.look(places, ALONG[3], 0).vector is not None
+    world.direction, world.rotation = 0.2, 0.0
+    assert world.look(places, ALONG[3], 200).vector is not None
+    world.direction, world.rotation, world.doubt = 0.1 + np.pi, -0.1 + np.pi, 0.3
+    assert world.look(places, ALONG[3], 200).vector is None
 
 
 # --------------------------------------------------------------------------------------------

@@ -364,8 +364,8 @@ def localiser(topology: TopologicalMap, settings: LocalisationSettings) -> Local
     """With a vocabulary of the map's own images."""
     words = VisualWords(topology.images, np.random.default_rng(0))
 
-    def linked(image: OmniFeatures, node: int) -> Answer:
-        return link_by_landmarks(image, topology.images[node])
+    def linked(image: OmniFeatures, nodes: Iterable[int]) -> dict[int, Answer]:
+        return {k: link_by_landmarks(image, topology.images[k]) for k in nodes}
 
     return Localiser(transition_along(topology.graph()), words, linked, settings)
 
