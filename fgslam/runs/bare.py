@@ -100,7 +100,8 @@ def bare_experiment(
     rig, stamps = sequence.rig, sequence.timestamps
     duration = float(stamps[-1] - stamps[0])
     rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
-    lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
+    rectifier = getattr(sequence, "rectifier", None)
+    lenses = ", unrectified" if rectifier is not None and rectifier.maps else ""
     motion = {
         "recorded": "a gyroscope, no odometry" if known and known[0].turned else "odometry",
         "constant_velocity": "no odometry",

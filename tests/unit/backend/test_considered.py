@@ -52,7 +52,7 @@ from fgslam.core.correction import (
 from fgslam.core.sensors import CameraRig, Increment, SettledRig
 from fgslam.core.store import restore, state_of
 from fgslam.core.types import Floor, LandmarkMap, Prediction, UpdateStats
-from fgslam.evaluation.statistics import landmark_nees, nees, pose_errors, pose_nees, within
+from fgslam.evaluation.statistics import nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.build import make_estimator
@@ -121,9 +121,7 @@ def per_dof(drives: list[Simulation], ego_motion: EgoMotionSettings | None) -> F
         at = found.trajectory.poses, found.covariances
         poses.append(pose_nees(at[0][-1:], at[1][-1:], drive.poses[-1:]))
         truth = drive.points_by_id[found.landmarks.ids]
-        landmarks.append(
-            landmark_nees(found.landmarks.positions, found.landmarks.covariances, truth)
-        )
+        landmarks.append(nees(truth - found.landmarks.positions, found.landmarks.covariances))
         inside.append(within(pose_errors(at[0][1:], drive.poses[1:]), at[1][1:]))
     means = [
         sum(n.values.sum() for n in of) / sum(n.dof.sum() for n in of) for of in (poses, landmarks)
@@ -323,7 +321,7 @@ def test_a_loop_leaves_the_covariances_those_of_the_errors(matches: int, drives:
             values.append(pose_nees(*at, drive.poses[k][None]).values.sum() / 6.0)
         found = estimator.estimate().landmarks
         truth = drive.points_by_id[found.ids]
-        errors = landmark_nees(found.positions, found.covariances, truth)
+        errors = nees(truth - found.positions, found.covariances)
         landmarks.append(errors.values.sum() / errors.dof.sum())
     for values in (closing, last, landmarks):
         assert 0.4 < np.mean(values) < 2.0

@@ -26,7 +26,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.store import state_of
 from fgslam.core.types import Floor, Prediction, UpdateStats
-from fgslam.evaluation.statistics import judge, landmark_nees, pose_nees
+from fgslam.evaluation.statistics import judge, nees, pose_nees
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
@@ -263,9 +263,7 @@ def test_pose_and_landmarks_are_consistent_over_20_drives() -> None:
         poses.append(
             pose_nees(found.trajectory.poses[1:], found.covariances[1:], simulation.poses[1:])
         )
-        landmarks.append(
-            landmark_nees(found.landmarks.positions, found.landmarks.covariances, truth)
-        )
+        landmarks.append(nees(truth - found.landmarks.positions, found.landmarks.covariances))
         innovations += [s.nis / s.nis_dof for s in stats if s.nis_dof]
     for runs in (poses, landmarks):
         verdict = judge(runs)

@@ -34,7 +34,7 @@ from fgslam.core.types import Estimate, Floor, LandmarkMap, Prediction
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
-from fgslam.evaluation.statistics import judge, landmark_nees
+from fgslam.evaluation.statistics import judge, nees
 from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.replay import replay
@@ -194,7 +194,7 @@ def test_waiting_landmarks_are_reported_with_a_consistent_covariance() -> None:
         )
         once = np.flatnonzero(counts[found.ids] == 1)
         truth = simulation.points_by_id[found.ids[once]]
-        errors.append(landmark_nees(found.positions[once], found.covariances[once], truth))
+        errors.append(nees(truth - found.positions[once], found.covariances[once]))
     verdict = judge(errors)
     assert verdict is not None
     assert verdict.items > 40
@@ -468,7 +468,7 @@ HARD = SimulatedMeasurementsSettings(
 """Up to 54 deviations squared a number, as the last ten frames have them, in a single step."""
 
 
-def nees(settings: EstimatorSettings, seed: int) -> float:
+def pose_nees(settings: EstimatorSettings, seed: int) -> float:
     drive = open_measurements(HARD, seed, ConstantVelocitySettings())
     played = replay(drive.log, settings, EgoMotionSettings(dof=3))
     found = judge_replay(played, Truth(drive.ground_truth, None)).metrics.nees_pose_per_dof
@@ -478,4 +478,4 @@ def nees(settings: EstimatorSettings, seed: int) -> float:
 
 def test_a_step_that_was_not_foreseen_does_not_pull_the_path() -> None:
     """Without the kernel 2.4."""
-    assert np.mean([nees(BatchSettings(), seed) for seed in (2, 5)]) < 1.2
+    assert np.mean([pose_nees(BatchSettings(), seed) for seed in (2, 5)]) < 1.2
