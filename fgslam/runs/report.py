@@ -376,10 +376,10 @@ def draw_run(run: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*.png") if path.stem in _FIGURES_OF_THE_PAGE)
 
 
-def load_report(folder: Path, run: Path | None = None, page: bool = False) -> ReportData:
+def load_report(folder: Path, run: Path | None = None, whole: bool = False) -> ReportData:
     """What a folder holds; arguments and errors as :func:`report_from_folder`.
 
-    The cost of a frame and the small views are read for a page alone.
+    The cost of a frame and the small views, which a film does not show, are read only if ``whole``.
     """
     if run is None and not (folder / LOG_FILE).is_file():
         above = folder.resolve().parent
@@ -449,10 +449,10 @@ def load_report(folder: Path, run: Path | None = None, page: bool = False) -> Re
         up=_up(find(LOG_FILE)),
         alarms=alarms(found, (steered or {}).get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
-        stages=_stages(file) if page and (file := find("timing.csv")) else None,
+        stages=_stages(file) if whole and (file := find("timing.csv")) else None,
         views={
             int(path.stem.rpartition("_")[2]): path.read_bytes()
-            for path in (pictures.glob(f"{VIEW}_*.jpg") if page else ())
+            for path in (pictures.glob(f"{VIEW}_*.jpg") if whole else ())
         },
         about=tuple((one.title, _kind_in_words(one.kind)) for one in estimators),
         commands=next_commands(folder.resolve().name) if find(LOG_FILE) else (),

@@ -315,7 +315,7 @@ def view_run(run: Path, save: Path | None, overwrite: bool = False) -> str:
     rerun = _library(save)
     if save is not None:
         require_output(save, overwrite, (run,))
-    data = load_report(run)
+    data = load_report(run, whole=True)
     live = save is None and _has_screen()
     target = None if live else save or run / f"view{SUFFIX}"
     with _streaming(rerun, data.title, live, target) as stream:

@@ -9,6 +9,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from running import KIND, Finished, main
@@ -193,14 +194,17 @@ def test_what_is_no_result_is_refused_in_words(run: Path, tmp_path: Path) -> Non
 # The viewer
 
 
-def test_a_run_is_saved_for_the_viewer(finished: Finished, tmp_path: Path) -> None:
+def test_a_run_is_saved_for_the_viewer(run: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
-    target = tmp_path / "run.rrd"
+    (run / "pictures").mkdir(exist_ok=True)
+    assert cv2.imwrite(str(run / "pictures/view_000003.jpg"), np.zeros((24, 32), np.uint8))
+    target = tmp_path / "saved" / "run.rrd"
+    target.parent.mkdir()
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what rerun cannot log it only warns about
-        said = view_run(finished.folder, target)
+        said = view_run(run, target)
     assert said.startswith(f"{target}: written")
-    assert [path.name for path in tmp_path.iterdir()] == ["run.rrd"]
+    assert [path.name for path in target.parent.iterdir()] == ["run.rrd"]
     listed = subprocess.run(  # noqa: S603 - our own interpreter
         [sys.executable, "-m", "rerun_cli", "rrd", "print", str(target)],
         capture_output=True,
@@ -215,6 +219,7 @@ def test_a_run_is_saved_for_the_viewer(finished: Finished, tmp_path: Path) -> No
         f"/error_m/{KIND}",
         f"/nees_per_dof/{KIND}",
         f"/update_ms/{KIND}",
+        "/view",
         "/about",
     ):
         assert f" - {entity} - " in listed, entity
