@@ -342,11 +342,14 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
         raise DatasetError(f"{path}, line 1: not '{_HEADER}'; run the experiment again")
     expected = f"{_HEADER}, as the experiment writes it again"
     values, _ = parse_rows(path, "\n" + rows.replace(",", " "), 5, expected)
-    if not (np.isfinite(values).all() and (np.diff(values[:, 0]) > 0.0).all()):
+    ids = values[:, 0]
+    ordered = (np.diff(ids) > 0.0).all() and (ids == np.rint(ids)).all()
+    if not (ordered and np.isfinite(values).all()):
         raise DatasetError(
-            f"{path}: ids do not increase or a number is not finite; run the experiment again"
+            f"{path}: ids do not increase by whole numbers, or a number is not finite; run the "
+            "experiment again"
         )
-    truth = LandmarkTruth(values[:, 0].astype(np.int64), values[:, 1:4].copy())
+    truth = LandmarkTruth(ids.astype(np.int64), values[:, 1:4].copy())
     return truth, values[:, 4].copy()
 
 

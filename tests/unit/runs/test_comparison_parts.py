@@ -243,6 +243,7 @@ def test_landmark_truth_reads_back(tmp_path: Path, rng: np.random.Generator) -> 
         ("x,y\n", "line 1: not 'id,x,y,z,sigma_m'"),
         ("id,x,y,z,sigma_m\n1,0,0,0,0\n2,0,zero,0,0\n", "line 3: could not convert"),
         ("id,x,y,z,sigma_m\n2,0,0,0,0\n1,0,0,0,0\n", "ids do not increase"),
+        ("id,x,y,z,sigma_m\n1.5,0,0,0,0\n", "ids do not increase by whole numbers"),
         ("id,x,y,z,sigma_m\n2,0,nan,0,0\n", "not finite"),
     ],
 )
