@@ -190,6 +190,8 @@ def require_classics(names: Sequence[str]) -> None:
     """Raises ConfigError for a name that is neither a classic nor a file."""
     for name in names:
         if name not in CLASSICS and not Path(name).is_file():
+            if Path(name).suffix:
+                raise ConfigError(f"{name}: no such file; give the path of one that is there")
             raise ConfigError(
                 f"no classic {name!r}; give {', '.join(CLASSICS)}, a .g2o file, or "
                 f"Robot1{_MRCLAM} of UTIAS MRCLAM"

@@ -130,3 +130,9 @@ def test_an_unknown_name_is_refused_with_those_that_are_known() -> None:
     require_classics(CLASSICS)
     with pytest.raises(ConfigError, match="no classic 'manhattan'; give victoria_park"):
         require_classics(["manhattan"])
+
+
+@pytest.mark.parametrize("name", ["Robot1_Measurement.dat", "folder/manhattan.g2o"])
+def test_a_file_that_is_absent_is_named_as_such(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{name}: no such file; give the path"):
+        require_classics([name])
