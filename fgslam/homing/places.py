@@ -38,7 +38,7 @@ _STEP_PRIOR = 3.0 * np.array([0.1, 0.5, 0.4])
 """Chances to be at the path image before, at the same or at the one after by the next image, as if
 seen in so many steps."""
 _KEPT = 0.9  # of what earlier steps tell of the next one: of some ten
-_AGAIN = 8  # path images at most that are looked at again by all candidate matches
+_LOOKED_AGAIN = 5  # path images at most that are looked at again by all candidate matches
 _EVEN = 0.5  # chance that a vector is wrong which all candidate matches do not tell from others
 _CANDIDATES_EACH = 2.5  # inliers of all candidates over those of matches, on a school floor
 _ALIKE = 0.02
@@ -183,7 +183,7 @@ class PathPlaces:
         self._twice, self._repeated = set(), set()
         if not any(map(_is_clear, found.values())):
             best = sorted(nodes, key=lambda k: (inliers_of(found)[k], len(self._matches[k])))
-            self._twice = {*best[-_AGAIN:], *self._wanted()} & found.keys()
+            self._twice = {*best[-_LOOKED_AGAIN:], *self._wanted()} & found.keys()
         return found | {k: self._looked_again(image, k, found[k]) for k in sorted(self._twice)}
 
     def _looked_again(self, image: OmniFeatures, node: int, first: Answer) -> Answer:
