@@ -259,12 +259,12 @@ def fixed_point(
     if not np.isfinite(cost[best]):
         return None
     whole, slope = hessian[best], gradient[best]
-    if not slope @ np.linalg.solve(whole, slope) < _SETTLED:
-        return None
     own = whole[:3, :3] - whole[:3, 3:] @ np.linalg.solve(whole[3:, 3:], whole[3:, :3])
     information = np.linalg.eigvalsh(own)[0]
     distance = float(np.linalg.norm(points[best] - here))
-    if information * distance**2 < _KNOWN**2:
+    if information * distance**2 < _KNOWN**2:  # singular, too: of a robot that stands
+        return None
+    if not slope @ np.linalg.solve(whole, slope) < _SETTLED:
         return None
     apart = np.linalg.norm(points - points[best], axis=1) ** 2
     rivals = (cost < cost[best] + _RIVAL) & (apart * information > _RIVAL)

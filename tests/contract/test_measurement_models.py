@@ -240,6 +240,15 @@ def test_a_beacon_is_found_only_where_the_search_reached_a_minimum() -> None:
     assert not len(found.estimate.landmarks)
 
 
+def test_a_robot_that_stands_finds_no_beacon_by_its_range() -> None:
+    log, ranges = MeasurementLog(), Range().measured([3.0], [[0.01]], [0])
+    for k in range(7):
+        log.append(Increment.of(k, float(k), Odometry(np.eye(4), 1e-12 * np.eye(6)), [ranges]))
+    found = fg.replay(log, "ekf")
+    assert not found.failure
+    assert not len(found.estimate.landmarks)
+
+
 @pytest.mark.parametrize("measured", ["direction", "offset_range"])
 @pytest.mark.parametrize("kind", ["ekf", "landmark_kalman"])
 def test_resumed_with_landmarks_that_wait_continues_to_the_same_bits(
