@@ -172,7 +172,7 @@ def _loop(
     shown = frames_to_show(len(sequence)) if output.pictures else frozenset()
     frames = make_stream(sequence, frontend, frontend.tracking == "sift")
     stream = frames(start=len(recorder))
-    if len(os.sched_getaffinity(0)) > 1:
+    if (os.cpu_count() or 1) > 1:
         outputs.pipeline.look_ahead = lambda: session.describer.begin(frames.upcoming())
     waiting = time.perf_counter()
     interval, saved = output.checkpoint_seconds, waiting
