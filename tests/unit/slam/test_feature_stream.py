@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from fgslam.core.arrays import Image
 from fgslam.core.log import Frame
 from fgslam.core.types import Features
-from fgslam.slam.feature_stream import FrameDescriber
+from fgslam.slam.feature_stream import FeatureStream, FrameDescriber
 
 PLACES = np.array([[10.0, 10.0], [20.0, 10.0], [30.4, 10.0]])
 SCALES = np.array([2.0, 2.0, 4.0])
@@ -53,3 +54,23 @@ def test_features_that_were_begun_are_found_once_and_in_a_thread() -> None:
     describer.describe(1, Frame(1, 0.1, frame.images))
     assert threads[1:] == [threading.get_ident()]
     describer.close()
+
+
+class Frames(list[Frame]):
+    """A sequence of them."""
+
+    frame = list.__getitem__
+
+
+def test_the_upcoming_frame_is_the_one_that_comes_next() -> None:
+    images = (np.zeros((20, 40), np.uint8),) * 2
+    frames = [Frame(k, 0.1 * k, images) for k in range(6)]
+    sequence: Any = Frames(frames)
+    stream = FeatureStream(sequence, None)
+    assert stream.upcoming() is None
+    expected: Frame | None = frames[2]
+    for found in stream(start=2):
+        assert found.frame is expected
+        expected = stream.upcoming()
+    assert found.i == 5
+    assert expected is None
