@@ -179,7 +179,7 @@ def _before(rig: CameraRig, wTc: FloatArray, landmarks: LandmarkMap) -> BoolArra
 
 NEIGHBOURS = 1  # frames this near in the recording are no revisit
 SAME_M, SAME_DEG = 2.0, 30.0
-RIGHT_M, RIGHT_DEG = 0.30, 5.0
+LINKED_M, LINKED_DEG = 0.30, 5.0
 # One frame's landmarks seldom fix a pose as well as a map's: how vague is a link allowed to be?
 VAGUE_M, VAGUE_DEG = 0.3, 5.0
 _VAGUE = (
@@ -268,7 +268,7 @@ def link_frames(data: Path = DATA, overrides: Iterable[str] = (), every: int = 1
     return Links(
         same=(apart_m <= SAME_M) & (apart_deg <= SAME_DEG),
         linked=found_too,
-        right=found_too & (error_m <= RIGHT_M) & (error_deg <= RIGHT_DEG),
+        right=found_too & (error_m <= LINKED_M) & (error_deg <= LINKED_DEG),
         error_m=np.where(found_too, error_m, np.nan),
         error_deg=np.where(found_too, error_deg, np.nan),
         sigma_m=sigma_m,
@@ -298,7 +298,7 @@ def recognised_tables(data: Path = DATA, every: int = 1) -> list[Table]:
             [_row(title, links) for title, links in limits.items()],
             (
                 f"A true revisit: poses within {SAME_M:g} m and {SAME_DEG:g} degrees.",
-                f"Rightly: relative pose within {RIGHT_M:g} m and {RIGHT_DEG:g} degrees.",
+                f"Rightly: relative pose within {LINKED_M:g} m and {LINKED_DEG:g} degrees.",
             ),
         )
     ]
