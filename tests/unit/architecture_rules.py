@@ -360,12 +360,24 @@ def _docstring_lines(node: ast.Module | ast.ClassDef | FunctionNode) -> range:
 
 
 def statement_violations(module: Module) -> Iterator[Violation]:
-    """Calls that run data as code or hide randomness, as far as ruff does not know them."""
+    """Calls that run data as code or hide randomness, as far as ruff does not know them.
+
+    And constants of one name: the last one counts for all of the module, whatever the first states.
+    """
     for node in module.nodes:
         message = _call_violation(node) if isinstance(node, ast.Call) else None
         # The package's own __init__ looks its public names up in a table (PEP 562).
         if message and not (message == _COMPUTED_IMPORT and "." not in module.name):
             yield Violation(module.path, getattr(node, "lineno", 1), message)
+    constants = set[str]()
+    for node in module.tree.body:
+        if isinstance(node, ast.Assign):
+            names = [n for n in ast.walk(node) if isinstance(n, ast.Name)]
+            read = {n.id for n in names if isinstance(n.ctx, ast.Load)}
+            stored = {n.id for n in names if isinstance(n.ctx, ast.Store)}
+            for name in sorted((stored & constants) - read):
+                yield Violation(module.path, node.lineno, f"{name} has a value already")
+            constants |= stored
 
 
 def _call_violation(node: ast.Call) -> str | None:
