@@ -261,9 +261,11 @@ class SelfCalibration:
     def open_covariances(self, count: int) -> FloatArray:
         """(count, 6, 6) to be added to those of the last poses: what is open since the rig moved.
 
-        One rig or two, until poses follow that; then how well the new one is known.
+        One rig or two, until poses follow that; then how well the new one is known; from a frame on
+        in which no landmark fitted, until a window is solved, as well as a rig is stated.
         """
-        since = np.arange(self._seen - count, self._seen) + 1.0 - [*self.moves, self._failed][0]
+        begun = self._failed or [*self.moves, 0][0]
+        since = np.arange(self._seen - count, self._seen) + 1.0 - begun
         return np.asarray(np.maximum(since, 0.0)[:, None, None] ** 2 * self._open)
 
     def _moved(self, first: int) -> RigCorrection:
