@@ -204,9 +204,11 @@ def fuse(
     surface = fusion.surface(kept)
     if not len(surface.positions):
         raise DatasetError(
-            f"nothing was seen as well as {100.0 * kept:.3g} cm within "
-            f"{most:.3g} m; use larger voxels (--voxel {3.0 * voxel:.2g}) or a larger --range"
-        )
+            f"nothing was seen as well as {100.0 * kept:.3g} cm within {most:.3g} m; use "
+            + (f"larger voxels (--voxel {3.0 * voxel:.2g})" if settings.sigma_m is None
+               else f"a larger --sigma ({KEPT_SIGMA_VOXELS * voxel:.2g})")
+            + " or a larger --range"
+        )  # fmt: skip
     up = (estimate.trajectory.poses[:, :3, :3] @ vertical_of(rig.bTc)).mean(axis=0)
     length = float(np.linalg.norm(up))
     up = up / length

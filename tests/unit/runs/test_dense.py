@@ -220,3 +220,10 @@ def test_voxels_too_small_for_the_cameras_say_which_would_do() -> None:
         fused(DenseSettings(voxel_m=0.001))
     with pytest.raises(DatasetError, match="within 1 m; use larger voxels"):
         fused(DenseSettings(voxel_m=0.05, range_m=1.0))
+
+
+@pytest.mark.usefixtures("open3d")
+def test_a_sigma_that_nothing_has_says_which_would_do() -> None:
+    with pytest.raises(DatasetError, match=r"as 1e-05 cm .* use a larger --sigma \(0.02\)"):
+        fused(DenseSettings(voxel_m=0.01, sigma_m=1e-7))
+    assert len(fused(DenseSettings(voxel_m=0.01, sigma_m=0.02)).surface.positions)
