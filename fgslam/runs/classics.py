@@ -147,7 +147,10 @@ def _barcodes(path: Path) -> tuple[MeasurementLog, Trajectory]:
     late, early = (seen[:, 0] < min(seconds[-1], times[-1])), seen[:, 0] > max(seconds[0], times[0])
     seen = seen[late & early & np.isin(seen[:, 1], list(places))]
     if not len(seen):
-        raise DatasetError(f"{path}: sees no landmark while the truth lasts; give ROBOT{_MRCLAM}")
+        raise DatasetError(
+            f"{path}: sees no landmark of Landmark_Groundtruth.dat while odometry and truth last; "
+            "take all five files from one folder of UTIAS"
+        )
     seen = seen[np.unique(seen[:, :2], axis=0, return_index=True)[1]]
     stamps, frames = np.unique(seen[:, 0], return_inverse=True)
     course[2] = np.unwrap(course[2])
