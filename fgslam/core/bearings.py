@@ -142,7 +142,8 @@ class TwoViewVector:
         covariance: (2, 2) of (direction, rotation).
         inliers: (n,) of the matches that were given.
         competing_support: inliers of the best *different* solution; 0 for none.
-        wrong_probability: probability that a different solution is the better one, 0.5 at most.
+        wrong_probability: probability that a different solution is the better one, 0.5 at most;
+            0.5, too, where the camera is neither level nor clearly tilted.
     """
 
     direction: float

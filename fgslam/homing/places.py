@@ -399,7 +399,8 @@ class PathPlaces:
 
         At little parallax, or with a camera that is tilted, another direction may fit nearly as
         well. Where earlier images tell which is right that does no harm; else all candidate
-        matches must tell, or it be seen alike in several images.
+        matches must tell, or it be seen alike in several images. The sigma takes in what it misses
+        the taught triangle by and, where its own does not hold, what it differs from those before.
         """
         answer = self._localiser.answers.get(aim.target)
         if answer is None:
@@ -415,20 +416,24 @@ class PathPlaces:
                 vector = None
         if vector is None:
             return None, why
-        unclear = aim.target != nearest and (
-            why or aim.target > nearest + 1 or aim.target in self._twice
-        )
-        if unclear and not self._confirmed_by_path(aim.target, vector):
+        misfit = self._misfit_of_path(aim.target, vector)
+        unclear = why or aim.target > nearest + 1 or aim.target in self._twice
+        if aim.target != nearest and (misfit == np.inf or (unclear and np.isnan(misfit))):
             return None, "is not confirmed by the path images before and after"
+        before = _away(_across(vector), aim.across) if _is_even(vector) else np.nan
+        off = np.nan_to_num([before, misfit], posinf=0.0).max()
+        vector = replace(vector, covariance=vector.covariance + off**2 * np.eye(2))
         aim.widest = max(aim.widest, self._parallax.get(aim.target, 0.0))
         aim.across, aim.heading, aim.agreeing = _across(vector), vector.rotation, 0
         return vector, ""
 
-    def _confirmed_by_path(self, target: int, vector: TwoViewVector) -> bool:
-        """Whether target, robot and a path image next to it make a triangle as taught.
+    def _misfit_of_path(self, target: int, vector: TwoViewVector) -> float:
+        """Angle by which the target, seen from the robot, misses a triangle as taught, radians.
 
-        One is enough: of the other the vector to that path image may be wrong.
+        With the path image before or after; the lesser one, as of the other the vector to that path
+        image may be wrong. Inf: more than chance explains; NaN: there is no triangle.
         """
+        misfits = list[float]()
         for begin in (target - 1, target):
             seen = self._localiser.answers.get(2 * begin + 1 - target)
             leg = self._leg(begin)[0] if seen and not _is_even(seen) else None
@@ -438,10 +443,10 @@ class PathPlaces:
                 onwards = leg.direction + first.rotation
                 aside = between_misfit(first.direction, onwards, whole.direction)
                 # Of a way back the third side may have any direction: it confirms nothing.
-                shows = _away(onwards, first.direction) < np.pi - _TRIANGLE
-                if shows and max(turned, aside) <= _limit(vector, seen, leg, least=_TRIANGLE):
-                    return True
-        return False
+                if _away(onwards, first.direction) < np.pi - _TRIANGLE:
+                    misfit, limit = max(turned, aside), _limit(vector, seen, leg, least=_TRIANGLE)
+                    misfits.append(misfit if misfit <= limit else np.inf)
+        return min(misfits, default=np.nan)
 
     def _leg(self, begin: int) -> tuple[Answer, BearingMatches]:
         """Of a path image to the one after it."""
