@@ -122,8 +122,8 @@ class HomingSearch:
         carried = self._carried(refined, candidates)
         answer = self._judged(carried or refined)
         if answer and not carried and self._refinement.strain(refined[0]) > _LEVEL:
-            # Neither level nor clearly tilted: the sigma holds for neither. Of 285 answers along
-            # routes of a rendered house 14 are so, and 9 of these beyond three sigma, of the others 36.
+            # Neither level nor clearly tilted: the sigma holds for neither. Of 285 answers in a
+            # rendered house 14 are so; 9 of these are beyond three sigma, of the others 36.
             return replace(answer, wrong_probability=0.5)
         return answer
 
@@ -359,10 +359,8 @@ class HomingSearch:
         support = self.independent_inliers(best.inliers)
         alarms = self._log_false_alarms(best)
         if support < s.min_inliers:
-            reason, text = (
-                RefusalReason.TOO_FEW_INLIERS,
-                f"{support} inliers of {len(self._matches)}",
-            )
+            reason = RefusalReason.TOO_FEW_INLIERS
+            text = f"{support} inliers of {len(self._matches)}"
         elif alarms > np.log(s.max_false_alarms):
             reason = RefusalReason.TOO_FEW_INLIERS
             text = (

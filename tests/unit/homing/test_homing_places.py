@@ -205,6 +205,22 @@ def test_the_first_direction_to_a_path_image_must_be_clear_or_be_seen_again(worl
     assert given == [False, False, False, True, True]
 
 
+def sigma_of(place: PathPlace) -> float:
+    """Radians, of a direction."""
+    assert place.vector is not None
+    return float(np.sqrt(place.vector.covariance[0, 0]))
+
+
+def test_sigma_covers_what_the_taught_triangle_and_earlier_images_miss(world: World) -> None:
+    """The leg turns by 0.1, the vectors to its ends do not; in doubt 0.3 away from before."""
+    places = PathPlaces(world.path, DRIVING)
+    assert sigma_of(world.look(places, ALONG[3], 0)) == pytest.approx(np.hypot(0.01, 0.1))
+    world.direction += 0.3
+    assert sigma_of(world.look(places, ALONG[3], 200)) == pytest.approx(np.hypot(0.01, 0.1))
+    world.direction, world.doubt = world.direction - 0.3, 0.5
+    assert sigma_of(world.look(places, ALONG[3], 200)) == pytest.approx(np.hypot(0.01, 0.3))
+
+
 def test_a_direction_that_is_wrong_by_half_a_turn_is_seen_by_the_turns_before(world: World) -> None:
     """Its way in the target's axes is right; the robot turned by 0.1 from image to image."""
     places, world.rotation = PathPlaces(world.path, DRIVING), 0.1

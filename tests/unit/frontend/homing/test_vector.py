@@ -95,6 +95,15 @@ def test_tilted_cameras_are_estimated() -> None:
     assert np.median(free) < 0.3 * np.median(level)
 
 
+def test_where_a_camera_is_neither_level_nor_clearly_tilted_another_solution_may_be_right() -> None:
+    tilts = (np.deg2rad([2.0, -1.0]), np.deg2rad([-1.5, 1.0]))
+    for tilt, even in ((None, 0), (tilts, 5)):
+        answers = [answer(two_views(seed, 50, np.deg2rad(0.2), tilts=tilt)) for seed in range(10)]
+        chances = [v.wrong_probability for v in answers if isinstance(v, TwoViewVector)]
+        assert len(chances) >= 8
+        assert (chances.count(0.5) >= 5) == bool(even)
+
+
 def test_a_camera_that_is_lifted_on_the_way_is_distinguished_from_the_plane() -> None:
     """As far up or down as on, tilted by a degree: held to the plane 2 of 20 had an answer."""
     errors = []
