@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,7 +75,7 @@ def starts_new_part(increment: Increment, tracking: EgoMotion) -> bool:
 
 
 def with_unknown_step(
-    increment: Increment, tracking: EgoMotion, before: FloatArray, times: Sequence[float]
+    increment: Increment, tracking: EgoMotion, before: FloatArray, times: Iterable[float]
 ) -> Increment:
     """The increment; its step free to be any other where nothing ties it to the frames before.
 
@@ -87,12 +87,13 @@ def with_unknown_step(
         increment: the frame.
         tracking: its pose.
         before: (4, 4) the last pose.
-        times: (n,) of the frames before.
+        times: (n,) of the frames before; looked at where the step is unknown.
     """
     if not (increment.relocalised or starts_new_part(increment, tracking)):
         return increment
-    guess, late = increment.odometry, len(times) > 1 and not increment.relocalised
-    late = late and increment.timestamp - times[-1] > _GAP * float(np.median(np.diff(times)))
+    guess, stamps = increment.odometry, np.fromiter(times, np.float64)
+    late = len(stamps) > 1 and not increment.relocalised
+    late = late and increment.timestamp - stamps[-1] > _GAP * float(np.median(np.diff(stamps)))
     covariance = (guess.covariance if late and guess is not None else FREE).copy()
     step = Odometry(inverse(before) @ tracking.wTc, covariance, measured=False)
     if guess is not None and guess.turned:

@@ -144,8 +144,8 @@ def _barcodes(path: Path) -> tuple[MeasurementLog, Trajectory]:
     seconds, *course = rows(f"{robot}_Groundtruth.dat", "time", "x", "y", "heading").T
     seen = rows(path.name, "time", "barcode", "range", "bearing")
     seen[:, 1] = [subjects.get(code, -1.0) for code in seen[:, 1].tolist()]  # robots have some, too
-    late, early = (seen[:, 0] < min(seconds[-1], times[-1])), seen[:, 0] > max(seconds[0], times[0])
-    seen = seen[late & early & np.isin(seen[:, 1], list(places))]
+    known_at = (seen[:, 0] > max(seconds[0], times[0])) & (seen[:, 0] < min(seconds[-1], times[-1]))
+    seen = seen[known_at & np.isin(seen[:, 1], list(places))]
     if not len(seen):
         raise DatasetError(
             f"{path}: sees no landmark of Landmark_Groundtruth.dat while odometry and truth last; "

@@ -245,7 +245,8 @@ class FastSlam:
     def _mixture(self, poses: FloatArray, covariances: FloatArray) -> Prediction:
         """Mean and covariance of weighed normal distributions (n, 4, 4), (n, 6, 6)."""
         centre = poses[int(np.argmax(self._weights))]
-        off = np.array([se3_log(inverse(centre) @ wTc) for wTc in poses])
+        cTw = inverse(centre)
+        off = np.array([se3_log(cTw @ wTc) for wTc in poses])
         mean = self._weights @ off
         spread = np.einsum("n,ni,nj->ij", self._weights, off - mean, off - mean)
         wTc = self._retracted(centre[None], mean[None])[0]

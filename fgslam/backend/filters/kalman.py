@@ -129,9 +129,9 @@ class LandmarkKalman:
         closure, which is its uncertainty relative to the place returned to.
         """
         self._past.require_later(increment)
-        times, rig = self._past.timestamps, (increment.rig_correction, increment.rig_since)
+        times = self._past.timestamps
         increment = with_unknown_step(increment, tracking, self._current.wTc, times)
-        recalibrated(self, *rig)
+        recalibrated(self, increment.rig_correction, increment.rig_since)
         step = self._step(increment, tracking)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)

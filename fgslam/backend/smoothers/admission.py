@@ -87,7 +87,7 @@ class LandmarkAdmission:
         self._sensor = sensor
         self._settings = settings
         self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self.first_frame, self.staying = 0, list[int]()
+        self.first_frame, self.staying = 0, set[int]()
         self.tracks: dict[int, Track] = {}
         self.by_last_sighting: dict[int, Track] = {}
         self.remarks: list[str] = []

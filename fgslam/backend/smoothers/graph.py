@@ -503,8 +503,11 @@ class GraphBuilder:
                     self._enter(new, identity, landmarks.positions[at[0]], tracked.wTc, np.inf)
                     if not self._remember and self._waiting[identity][0][0] < frame:
                         self._waiting[identity] = [(frame, self._found(tracked, landmarks, at))]
-                    kinds = {one.kind for _, one in self._waiting[identity]}
-                    self.admission.staying += [track.variable] * (RelativePoint.kind in kinds)
+                    self.admission.staying.update(
+                        track.variable
+                        for _, one in self._waiting[identity]
+                        if one.kind == RelativePoint.kind
+                    )
             if track.variable >= 0:
                 for seen, one in self._waiting.pop(identity):
                     if seen >= self.admission.first_frame:

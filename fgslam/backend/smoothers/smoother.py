@@ -116,9 +116,9 @@ class Smoother:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
-        before = self.tracker.predict(None).wTc
         if self.inputs:
-            times = [one.increment.timestamp for one in self.inputs]
+            before = self.tracker.predict(None).wTc
+            times = (one.increment.timestamp for one in self.inputs)
             increment = with_unknown_step(increment, tracking, before, times)
         require_finite(increment, tracking)
         recalibrated(self, increment.rig_correction, increment.rig_since)

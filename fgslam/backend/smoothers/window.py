@@ -10,7 +10,7 @@ is linearised: judged where it has itself pulled the estimate to, a wrong match 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -820,7 +820,7 @@ class Window:
 
     # -- what leaves -------------------------------------------------------------------------
 
-    def let_go_before(self, first: int, staying: Sequence[int] = ()) -> Landmarks:
+    def let_go_before(self, first: int, staying: Collection[int] = ()) -> Landmarks:
         """Marginalises poses before a frame, and landmarks that only they saw, but some variables.
 
         Returns:
@@ -839,8 +839,8 @@ class Window:
         self.factors = untouched
         self._keep(lambda one: one.poses >= first)
         self._drop_poses(leaving)
-        left = np.concatenate([*(one.points for one in self._every), np.array(staying, np.int64)])
-        return self._eliminate(~np.isin(self.landmarks.variables, left))
+        left = [*(one.points for one in self._every), np.array([*staying], np.int64)]
+        return self._eliminate(~np.isin(self.landmarks.variables, np.concatenate(left)))
 
     def _keep(self, which: Callable[[Sightings], BoolArray]) -> None:
         """Those observations alone that a mask chooses."""
