@@ -88,7 +88,7 @@ def _log_log(axes: Axes, title: str, label: str) -> None:
     axes.set(xscale="log", yscale="log", title=title, xlabel="processor ms a frame", ylabel=label)
     axes.margins(0.06)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_formatter(NullFormatter())
     axes.grid(which="both", linewidth=0.5)
