@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from fgslam.runs.config import make_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
-from fgslam.runs.workers import Executor
+from fgslam.runs.workers import Executor, Pool
 from fgslam.slam.results import STAGES
 
 Capture = pytest.CaptureFixture[str]
@@ -88,7 +88,7 @@ def stop_after(frames: int) -> Callable[[], bool]:
     return stopped
 
 
-class Here(Executor):
+class Here(Pool):
     """Does units in this process; what cannot be sent to a worker and back fails as it would."""
 
     def run(self, function: Any, arguments: Any, stopped: Any, fresh: bool = False) -> Any:
@@ -97,7 +97,7 @@ class Here(Executor):
         def sent(value: Any) -> Any:
             return loads(dumps(value))
 
-        return super().run(lambda one: sent(sent(function)(sent(one))), arguments, stopped)
+        return Executor.run(self, lambda one: sent(sent(function)(sent(one))), arguments, stopped)
 
 
 @contextmanager
@@ -106,7 +106,7 @@ def units_in_this_process() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for module in ("engine", "library", "workers"):
-            patch.setattr(f"fgslam.runs.{module}.Pool", lambda *_, **__: nullcontext(Here()))
+            patch.setattr(f"fgslam.runs.{module}.Pool", Here)
         yield
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from advice_recordings import OF_RECORDINGS
 from advice_runs import OF_RUNS
-from running import ROOT, Capture, Patch, main
+from running import ROOT, Capture, Patch, main, units_in_this_process
 
 ADVICE = OF_RECORDINGS | OF_RUNS
 
@@ -28,7 +28,8 @@ def test_advice_works_when_it_is_followed(
     before, behind = (part.replace("{}", str(root)) for part in advice.command)
 
     def told(*words: object) -> tuple[int, str]:
-        code = main(monkeypatch, *words)
+        with units_in_this_process():
+            code = main(monkeypatch, *words)
         said = capfd.readouterr()
         return code, " ".join((said.out + said.err).split())
 
