@@ -9,6 +9,7 @@
 # %%
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -35,11 +36,12 @@ print(f"{len(path.images)} target, {kilobytes:.0f} kB")
 # stands, or looks again from farther on.
 
 # %%
-dt = 0.1
+dt, driven = 0.1, [house.true_pose]
 with fg.PathFollower(house.camera, path, estimator="homing_graph") as follower:
     for k in range(400):
         command = follower.step(house.image(k * dt), k * dt)
         house.drive(command.v, command.omega, dt)
+        driven.append(house.true_pose)
         if k % 20 == 0:
             print(f"{k * dt:4.1f} s  {command.v:4.2f} m/s  {np.degrees(command.omega):5.1f} deg/s")
         if follower.finished and command.v == command.omega == 0.0:
@@ -53,3 +55,15 @@ with fg.PathFollower(house.camera, path, estimator="homing_graph") as follower:
 distance = float(np.linalg.norm(house.true_pose[:2] - house.target_poses[-1][:2]))
 print(f"{leg.result}: {distance:.2f} m from the target")
 assert distance < 0.3
+
+# %% [markdown]
+# From above:
+
+# %%
+plt.axes(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(1.0, 9.0), ylim=(8.0, 16.0))
+for ends in house.outlines:
+    plt.plot(*ends.T, "grey", lw=0.8)
+plt.plot(*np.array(driven)[:, :2].T, "b", label="driven")
+plt.plot(*house.target_poses[:, :2].T, "r*", ms=12, label="target")
+plt.legend()
+plt.savefig("drive_home.png")

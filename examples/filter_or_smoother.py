@@ -5,6 +5,8 @@
 # filters and smoothers are compared on exactly the same measurements.
 
 # %%
+import matplotlib.pyplot as plt
+
 import fgslam as fg
 
 recording = fg.rendered_recording("lab", frames=16)
@@ -62,5 +64,10 @@ print(table[["ate_online_m", "ate_m", "nees"]].round(4))
 # ## The figure
 
 # %%
-figure = fg.plot(answers, truth)
+figure = fg.plot(answers, truth)  # paths, ellipses, errors and NEES over time, to zoom and click
 figure.write_html("filter_or_smoother.html")  # in a notebook: figure.show()
+centimetres = 100.0 * table[["ate_online_m", "ate_m"]]
+centimetres.columns = ["as first estimated, live", "the answer at the end"]
+bars = centimetres.plot.barh(xlabel="absolute trajectory error (cm)")
+bars.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+plt.savefig("filter_or_smoother.png", bbox_inches="tight")

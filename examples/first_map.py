@@ -7,6 +7,8 @@
 # camera or file: (height, width) or (height, width, 3), uint8 or uint16.
 
 # %%
+import matplotlib.pyplot as plt
+
 import fgslam as fg
 
 recording = fg.rendered_recording("lab", frames=12)  # for your own: a list of (t, images, odometry)
@@ -42,3 +44,14 @@ result.trajectory.save("path.tum")  # of the right camera; evo reads it
 result.map.save("map.ply")  # MeshLab, CloudCompare and Open3D read it
 slam.log.save("drive.npz")  # the measurements, for other estimators: see filter_or_smoother.py
 print(f"{len(result.trajectory)} poses, {len(result.map)} landmarks")
+
+# %% [markdown]
+# ## From above
+
+# %%
+landmarks, path = result.map.positions, result.trajectory.poses[:, :3, 3]
+plt.axes(aspect="equal", xlabel="right (m)", ylabel="ahead (m)")
+plt.scatter(landmarks[:, 0], landmarks[:, 2], 4, landmarks[:, 1], label="landmarks, by height")
+plt.plot(path[:, 0], path[:, 2], "r.-", label="path of the camera")
+plt.legend()
+plt.savefig("first_map.png")

@@ -10,6 +10,7 @@
 # images are rendered in a simulated house, by a hyperbolic mirror on a wheelchair.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -49,6 +50,25 @@ errors = [
 ]
 print(f"errors: {errors[0]:.2f} and {errors[1]:.2f} degrees")
 assert np.all(np.abs(errors) < 5.0)
+
+# %% [markdown]
+# As the camera sees it, and from above in the house:
+
+# %%
+figure, (view, plan) = plt.subplots(1, 2, figsize=(10.0, 5.0), layout="constrained")
+view.imshow(image, "gray")
+ahead = np.array([np.cos(answer.direction), np.sin(answer.direction), 0.0])
+view.plot(*camera.pixels(np.outer(1.0, ahead)).T, "rx", ms=15, mew=3, label="home lies there")
+view.legend(loc="lower left")
+for ends in house.outlines:
+    plan.plot(*ends.T, "grey", lw=0.8)
+bearing = here[2] + answer.direction
+plan.quiver(*here[:2], np.cos(bearing), np.sin(bearing), color="r", label="homing vector")
+plan.plot(*here[:2], "o", label="here")
+plan.plot(*there[:2], "*", ms=12, label="home")
+plan.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(1.0, 9.0), ylim=(8.0, 16.0))
+plan.legend()
+figure.savefig("homing_vector.png")
 
 # %% [markdown]
 # ## A refusal

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -64,3 +65,13 @@ for t, pair in TwoWebcams("left.avi", "right.avi"):
 result = slam.result()
 result.map.save("desk.ply")
 assert len(result.trajectory) == 12
+
+# %% [markdown]
+# The last image of the right camera: landmarks that it sees again, and new ones.
+
+# %%
+plt.imshow(pair[1])
+plt.plot(*step.matches.pixels[:, 0].T, "y+", label="seen again")
+plt.plot(*step.new.pixels[:, 0].T, "r+", label="new")
+plt.legend()
+plt.savefig("own_camera.png")

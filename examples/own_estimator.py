@@ -7,6 +7,7 @@
 # frame as it is, and leaves every landmark where it was first seen.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -89,3 +90,17 @@ table = fg.compare(answers, recording.ground_truth)
 print(table.round(4))
 assert "failure" not in table  # a column that is there where an estimator ended early
 assert table["ate_m"].idxmax() == "first_sight"
+
+# %% [markdown]
+# Errors along the way, each from its own first pose on:
+
+# %%
+assert recording.ground_truth is not None
+true = recording.ground_truth.poses
+true = np.linalg.inv(true[0]) @ true
+plt.axes(xlabel="time (s)", ylabel="error of the position (cm)")
+for name, answer in answers.items():
+    error = np.linalg.norm((answer.trajectory.poses - true)[:, :3, 3], axis=1)
+    plt.plot(answer.trajectory.timestamps, 100.0 * error, ".-", label=name)
+plt.legend()
+plt.savefig("own_estimator.png")

@@ -7,6 +7,7 @@
 
 # %%
 import gtsam
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -31,3 +32,11 @@ moved = [solved.atPose3(k).translation() - values.atPose3(k).translation() for k
 print(np.round(1e3 * np.array(moved)[:, 0], 1), "mm to the right")
 assert 0.03 < moved[-1][0] < 0.051  # odometry and matches hold against it
 assert abs(moved[0][0]) < 0.001
+
+# %% [markdown]
+# How the path bends:
+
+# %%
+plt.axes(xlabel="frame", ylabel="moved to the right (mm)")
+plt.plot(list(poses), 1e3 * np.array(moved)[:, 0], "o-")
+plt.savefig("own_factors.png")

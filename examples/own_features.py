@@ -11,6 +11,7 @@
 
 # %%
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -58,12 +59,18 @@ def orb(image: Image) -> fg.Features:
 # %%
 recording = fg.rendered_recording("lab", frames=12)
 results = {}
+plt.figure(figsize=(12.0, 3.5), layout="constrained")
 for name, extractor in {"SIFT": None, "RootSIFT": root_sift, "ORB": orb}.items():
     with fg.Slam(recording.rig, estimator="landmark_kalman", features=extractor) as slam:
         for t, images, odometry in recording:
             step = slam.track(t, images, odometry)
     print(f"{name:8} {len(step.matches)} matches in the last frame, {step.landmarks} landmarks")
     results[name] = slam.result()
+    assert images is not None
+    plt.subplot(1, 3, len(results), title=f"{name}: matched with the map", xticks=[], yticks=[])
+    plt.imshow(images[1], "gray")  # the right one, in which pixels come first
+    plt.plot(*step.matches.pixels[:, 0].T, "y+")
+plt.savefig("own_features.png")
 
 # %%
 table = fg.compare(results, recording.ground_truth)

@@ -7,6 +7,7 @@
 # an infrared sensor gives it; a robot on wheels drives a circle among ten of them.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -60,3 +61,14 @@ print(table.round(3).to_string())
 assert "failure" not in table  # a column that is there where an estimator ended early
 ate = dict(table["ate_m"])
 assert max(ate[kind] for kind in kinds) < 0.5 * ate["odometry"]
+
+# %% [markdown]
+# Over time:
+
+# %%
+plt.axes(xlabel="time (s)", ylabel="error of the position (m)")
+for kind, answer in answers.items():
+    error = np.linalg.norm((answer.trajectory.poses - true)[:, :3, 3], axis=1)
+    plt.plot(log.timestamps, error, label=kind)
+plt.legend()
+plt.savefig("own_measurement.png")

@@ -9,6 +9,7 @@
 # not jump sideways or up. It expects the last speed and the last turn.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -71,3 +72,14 @@ print(f"{len(step.matches)} matches in the last frame, {step.landmarks} landmark
 table = fg.compare({"isam2": result, "batch": fg.replay(slam.log, "batch")}, recording.ground_truth)
 print(table.round(4))
 assert table["ate_m"].max() < 0.02
+
+# %% [markdown]
+# From frame to frame, what the model expected and how far the camera went:
+
+# %%
+expected = [increment.odometry.motion[2, 3] for increment in slam.log if increment.odometry]
+plt.axes(xlabel="frame", ylabel="motion ahead (cm)", ylim=(0.0, 12.0))
+plt.plot(range(1, 12), 100.0 * np.diff(result.trajectory.poses[:, 2, 3]), "o-", label="found")
+plt.plot(range(12 - len(expected), 12), 100.0 * np.array(expected), "x--", label="expected")
+plt.legend()
+plt.savefig("own_motion.png")

@@ -5,6 +5,7 @@
 # the camera is: the pose with its covariance, or the reason why none is to be believed.
 
 # %%
+import matplotlib.pyplot as plt
 import numpy as np
 
 import fgslam as fg
@@ -38,6 +39,17 @@ error = np.linalg.norm(found.wTc[:3, 3] - (np.linalg.inv(first) @ true)[:3, 3])
 print(f"off by {100.0 * error:.1f} cm")
 assert found.found
 assert error < 0.05
+
+# %% [markdown]
+# From above, the map's landmarks and where the frame was found:
+
+# %%
+plt.axes(aspect="equal", xlabel="right (m)", ylabel="ahead (m)")
+plt.scatter(place.positions[:, 0], place.positions[:, 2], 4, "grey", label="landmarks")
+plt.plot(*(np.linalg.inv(first) @ true)[[0, 2], 3], "g+", ms=18, label="true place of the frame")
+plt.plot(*found.wTc[[0, 2], 3], "r.", label="found")
+plt.legend()
+plt.savefig("saved_map.png")
 
 # %% [markdown]
 # ## Going on in it

@@ -1,13 +1,16 @@
-"""Runs the examples as notebooks, and keeps them with what they print in docs/notebooks.
+"""Runs the examples as notebooks, and keeps them with what they print and draw in docs/notebooks.
 
     pip install -e '.[notebooks]'
     python -m scripts.make_notebooks [NAME ...]
 
-Then `python -m scripts.make_reference` sets what they print below the code of the tutorials.
+Then `python -m scripts.make_reference` sets what they print and draw below the code of the
+tutorials.
 """
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 import sys
 from tempfile import TemporaryDirectory
@@ -15,8 +18,9 @@ from tempfile import TemporaryDirectory
 import jupytext
 import nbformat
 from nbclient import NotebookClient
+from PIL import Image
 
-from scripts.make_reference import EXAMPLES, LIVE, notebook_of
+from scripts.make_reference import EXAMPLES, LIVE, notebook_of, picture_of
 
 
 def make(name: str) -> None:
@@ -26,10 +30,15 @@ def make(name: str) -> None:
         client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": folder}})
         client.execute(cwd=folder)
     for k, cell in enumerate(notebook.cells):
-        for one in cell.get("outputs", ()):  # Open3D greets Jupyter
-            one.text = re.sub(
-                r"^(Jupyter environment|\[Open3D INFO\]).*\n", "", one.text, flags=re.M
-            )
+        for one in cell.get("outputs", ()):
+            if one.output_type == "stream":  # Open3D greets Jupyter
+                one.text = re.sub(
+                    r"^(Jupyter environment|\[Open3D INFO\]).*\n", "", one.text, flags=re.M
+                )
+            elif "image/png" in one.get("data", ()):
+                drawn = _small(base64.b64decode(one.data["image/png"]))
+                picture_of(name).write_bytes(drawn)
+                one.data = {"image/png": base64.b64encode(drawn).decode()}
         cell.id, cell.metadata = f"{name}-{k}".replace("_", "-"), {}
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook.metadata = {"kernelspec": kernel}
@@ -37,6 +46,16 @@ def make(name: str) -> None:
     path.parent.mkdir(exist_ok=True)
     text = nbformat.writes(notebook)  # type: ignore[no-untyped-call]
     path.write_text(f"{text}\n", encoding="utf-8")
+
+
+def _small(drawn: bytes) -> bytes:
+    """A picture as small as it can be, without the version of what drew it."""
+    out = io.BytesIO()
+    with Image.open(io.BytesIO(drawn)) as given:
+        given.convert("RGB").quantize(255, Image.Quantize.FASTOCTREE).save(
+            out, "png", optimize=True
+        )
+    return out.getvalue()
 
 
 if __name__ == "__main__":

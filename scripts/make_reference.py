@@ -159,8 +159,8 @@ def tutorial_page(name: str) -> str:
     last = _END.format(f"{name}.py")
     if notebook_of(name).is_file():
         last = _NOTEBOOK.format(name)
-        printed = _printed(name)
-        parts = [part + printed.get(k, "") for k, part in enumerate(parts)]
+        shown = _shown(name)
+        parts = [part + shown.get(k, "") for k, part in enumerate(parts)]
     title, _, rest = parts[0].partition("\n")
     head = [title, _NOTE.format(f"{name}.py"), rest.strip()]
     return "\n\n".join([*head, *parts[1:], last])
@@ -184,11 +184,17 @@ def notebook_of(name: str) -> Path:
     return DOCS / "notebooks" / f"{name}.ipynb"
 
 
-def _printed(name: str) -> dict[int, str]:
-    """What each cell of a notebook prints, in a fenced block, by its number."""
-    out = {}
+def picture_of(name: str) -> Path:
+    """Where the picture that an example draws is kept."""
+    return DOCS / "images" / f"example_{name}.png"
+
+
+def _shown(name: str) -> dict[int, str]:
+    """What each cell of a notebook prints, in a fenced block, and its picture, by its number."""
+    out: dict[int, str] = {}
     for k, cell in enumerate(json.loads(notebook_of(name).read_text(encoding="utf-8"))["cells"]):
-        texts = ["".join(one.get("text", "")) for one in cell.get("outputs", ())]
+        outputs = cell.get("outputs", ())
+        texts = ["".join(one.get("text", "")) for one in outputs]
         lines = [
             part.rstrip()
             for line in "".join(texts).splitlines()
@@ -196,6 +202,8 @@ def _printed(name: str) -> dict[int, str]:
         ]
         if lines:
             out[k] = "\n".join(["\n\n```text", *lines, "```"])
+        if any("data" in one for one in outputs):
+            out[k] = f"{out.get(k, '')}\n\n![What it draws](../images/{picture_of(name).name})"
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 
@@ -20,7 +21,9 @@ from scripts.make_reference import (
     commands_page,
     notebook_of,
     pages,
+    picture_of,
 )
+from scripts.make_tutorial_pictures import LARGEST
 from scripts.reference_experiments import unreasoned
 from scripts.reference_settings import WIDTH, item, settings_page
 
@@ -129,9 +132,13 @@ def test_items_break_between_words_but_not_in_code() -> None:
 
 
 @pytest.mark.parametrize("name", sorted({p.stem for p in EXAMPLES.glob("*.py")} - {*LIVE}))
-def test_the_notebook_of_an_example_has_its_code_and_what_it_prints(name: str) -> None:
+def test_the_notebook_of_an_example_has_its_code_what_it_prints_and_its_picture(name: str) -> None:
     cells = json.loads(notebook_of(name).read_text(encoding="utf-8"))["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     stale = f"stale: run python -m scripts.make_notebooks {name}"
     assert code == [body for body, text in cells_of(name) if not text], stale
-    assert any(one.get("name") == "stdout" for cell in cells for one in cell.get("outputs", ()))
+    outputs = [one for cell in cells for one in cell.get("outputs", ())]
+    assert any(one.get("name") == "stdout" for one in outputs)
+    drawn = [base64.b64decode(one["data"]["image/png"]) for one in outputs if "data" in one]
+    assert drawn == [picture_of(name).read_bytes()], stale
+    assert len(drawn[0]) < LARGEST
