@@ -23,7 +23,6 @@ from fgslam.runs.named_experiments import find_experiment, list_experiments
 from fgslam.runs.wanted import Wanted
 
 if TYPE_CHECKING:
-    from fgslam.runs.classics import ClassicRow
     from fgslam.runs.config import Experiment
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
@@ -295,7 +294,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
                  ("--seed", seed is not None))  # fmt: skip
         if ignored := next((option for option, value in given if value), ""):
             raise ConfigError(f"{ignored} means nothing for graphs, .g2o; leave it out")
-        _solve_graphs([str(run) for run in runs], None, estimators)
+        _solve_graphs([str(run) for run in runs], None, 1, estimators)
         return
     from fgslam.cli.console import show_parts
     from fgslam.runs.compare import Choice, ate_tables, compare_runs
@@ -319,7 +318,9 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     exit_as(results)
 
 
-def _solve_graphs(names: Sequence[str], steps: int | None, estimators: str | None = None) -> None:
+def _solve_graphs(
+    names: Sequence[str], steps: int | None, jobs: int | None, estimators: str | None = None
+) -> None:
     from fgslam.cli.console import show_parts
     from fgslam.runs.classics import (
         GRAPH_KINDS,
@@ -327,41 +328,43 @@ def _solve_graphs(names: Sequence[str], steps: int | None, estimators: str | Non
         classics_notes,
         classics_table,
         require_classics,
-        run_classic,
+        run_classics,
     )
 
     kinds = GRAPH_KINDS if estimators is None else estimators.split(",")
     if refused := sorted(set(kinds) - set(GRAPH_KINDS)):
         raise ConfigError(f"{refused[0]}: {NO_GRAPH}; give --estimators {','.join(GRAPH_KINDS)}")
     require_classics(names)
-    rows: list[ClassicRow] = []
-    with under_way() as (progress, _):
-        for k, name in enumerate(names):
-            progress("solving", k, len(names))
-            rows += run_classic(name, steps, kinds)
-        progress("solving", len(names), len(names))
-    show_parts((), [classics_table(rows)], [("note", note) for note in classics_notes(rows)])
+    with under_way() as (progress, stopped):
+        rows = run_classics(names, steps, kinds, jobs, progress, stopped)
+    tables = [classics_table(rows)] if rows else []
+    show_parts((), tables, [("note", note) for note in classics_notes(rows)])
+    if stopped():
+        raise SystemExit(signals.status())
 
 
 @command(app)
 def classics(
-    names: Annotated[list[str] | None, typer.Argument()] = None, steps: options.AtLeast1 = None
+    names: Annotated[list[str] | None, typer.Argument()] = None,
+    steps: options.AtLeast1 = None,
+    jobs: options.AtLeast1 = None,
 ) -> None:
     """Run well-known data sets, which come with GTSAM, through the estimators that fit.
 
     victoria_park, sphere2500, city10000, w10000 by iSAM2 and at once: filters and windows keep no
     old pose on which an edge could close a loop; victoria_park, which has no such edge, by three of
     them, too; kitti00, stereo tracks, by five; plaza1 and plaza2, ranges, and robots of UTIAS
-    MRCLAM by six. ATE and NEES where truth is known, chi-square, CPU of a step. All of them take
+    MRCLAM by six. ATE and NEES where truth is known, chi-square, time of a step. All of them take
     some minutes.
 
     Args:
         names (NAME...): which, or graphs, .g2o, or Robot1_Measurement.dat of UTIAS; default all
         steps: only so many steps of each drive
+        jobs: drives at a time; default one a core
     """
     from fgslam.runs.classics import CLASSICS
 
-    _solve_graphs(names or CLASSICS, steps)
+    _solve_graphs(names or CLASSICS, steps, jobs)
 
 
 @command(app)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -432,7 +433,8 @@ def compare(
     """Accuracy, consistency and speed of estimators on one recording, a row each.
 
     Columns are ``ate_m``, ``rpe_trans_m``, ``rpe_rot_deg``, ``nees`` and ``ms``; where an estimator
-    ended early ``failure``, too. With ``full`` all of these (NaN where a value cannot be known):
+    ended early ``failure``, too, which a warning states whole. With ``full`` all of these (NaN
+    where a value cannot be known):
 
     * ``kind``, ``frames``, ``landmarks``: which estimator, and how much it estimated.
     * ``ate_m``: absolute trajectory error, root mean square, after SE3 alignment (Sturm et al.
@@ -472,10 +474,10 @@ def compare(
     require_flag(full, "full")
     known = Truth(truth, landmark_truth, rig=rig)
     table = _frame({name: _judged(name, one, known) for name, one in answers.items()})
-    if full:
-        return table
-    failed = ["failure"] if (table["failure"] != "").any() else []
-    return table[[*_MAIN, *failed]]
+    ended = table.loc[table["failure"] != "", "failure"]
+    for name, why in ended.items():  # pandas cuts what it prints of it
+        warnings.warn(f"{name} ended early: {why}", stacklevel=2)
+    return table if full else table[[*_MAIN, *(["failure"] if len(ended) else [])]]
 
 
 def require_named(

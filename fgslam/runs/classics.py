@@ -6,9 +6,13 @@ by iSAM2 and at once; stereo tracks are replayed.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +46,8 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.compare import all_kinds
 from fgslam.runs.results import number_text
+from fgslam.runs.units import Progress, Stopped
+from fgslam.runs.workers import NOT_BEGUN, Executor, Failed, Pool
 from fgslam.slam.replay import replay
 
 GRAPH_KINDS = ("isam2", "batch")
@@ -201,6 +207,42 @@ def require_classics(names: Sequence[str]) -> None:
             )
 
 
+def run_classics(
+    names: Sequence[str],
+    steps: int | None,
+    kinds: Collection[str],
+    jobs: int | None,
+    progress: Progress,
+    stopped: Stopped,
+) -> list[ClassicRow]:
+    """The rows of several, in their order, each in a process of its own where ``jobs`` allows it.
+
+    Arguments are those of :func:`run_classic` and of :class:`~fgslam.runs.workers.Pool`; a bar of
+    progress for each drive that runs. What a stop ended has no rows.
+    """
+    rows: list[list[ClassicRow]] = [[] for _ in names]
+    jobs, left = min(len(names), jobs or os.cpu_count() or 1), [Path(name).name for name in names]
+    with Pool(jobs) if jobs > 1 else nullcontext(Executor()) as pool:
+        for name in left[:jobs]:  # they begin in their order
+            progress(name, 0, 1)
+        for k, found in pool.run(partial(_rows, steps, kinds), names, stopped):
+            if found == Failed(NOT_BEGUN):
+                break
+            name = Path(names[k]).name
+            left.remove(name)
+            if isinstance(found, Failed):
+                found = [ClassicRow(name, "all", 0, 0, why=found.why)]
+            rows[k] = found
+            progress(name, 1, 1)
+            for name in left[:jobs]:
+                progress(name, 0, 1)
+    return list(chain(*rows))
+
+
+def _rows(steps: int | None, kinds: Collection[str], name: str) -> list[ClassicRow]:
+    return list(run_classic(name, steps, kinds))
+
+
 def run_classic(
     name: str, steps: int | None = None, kinds: Collection[str] = GRAPH_KINDS
 ) -> Iterator[ClassicRow]:
@@ -272,7 +314,7 @@ def classics_table(rows: Sequence[ClassicRow]) -> TextTable:
         Column("ATE m", "root mean square position error, SE3 aligned, where truth is known"),
         Column("NEES", "of the poses per degree of freedom: 1 is right"),
         Column("chi-square", "of the whole graph at the answer"),
-        Column("ms a step\nmean longest", "CPU; of batch of the whole"),
+        Column("ms a step\nmean longest", "CPU, of replays time; of batch of the whole"),
     )
     shown = tuple(
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from fgslam.runs.classics import (
     classics_table,
     require_classics,
     run_classic,
+    run_classics,
 )
 
 
@@ -96,6 +98,29 @@ def test_barcodes_without_a_landmark_are_refused(tmp_path: Path, rng: np.random.
 def test_a_solver_that_is_not_asked_for_does_not_solve() -> None:
     for kind in ("isam2", "batch"):
         assert [one.estimator for one in run_classic("w10000", 40, [kind])] == [kind]
+
+
+def test_several_come_in_their_order_and_a_stop_begins_no_more() -> None:
+    told: list[tuple[str, int, int]] = []
+
+    def tell(*what: object) -> None:
+        told.append(what)
+
+    names = ["w10000", "city10000", "sphere2500"]
+    rows = run_classics(names, 30, ["batch"], 1, tell, lambda: len(told) > 3)
+    assert [one.classic for one in rows] == names[:2]
+    assert told[:3] == [("w10000", 0, 1), ("w10000", 1, 1), ("city10000", 0, 1)]
+
+
+@pytest.mark.slow
+def test_workers_find_what_one_process_does() -> None:
+    both = []
+    for jobs in (1, 2):
+        rows = run_classics(
+            ["plaza2", "w10000"], 40, ["isam2"], jobs, lambda *_: None, lambda: False
+        )
+        both.append([replace(one, step_ms=None, worst_ms=None) for one in rows])
+    assert both[0] == both[1]
 
 
 @pytest.mark.slow
