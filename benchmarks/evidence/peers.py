@@ -78,6 +78,7 @@ class Outcome:
 
 def tables(data: Path, only: Path | None = None) -> Iterator[Table]:
     """Of all recordings at hand, or of one."""
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed program has its bytecode
     vocabulary = _vocabulary(data)
     programs = dict(PROGRAMS)
     if vocabulary is None:

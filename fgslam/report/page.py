@@ -117,7 +117,8 @@ def _packed(text: str) -> str:
     bits = np.unpackbits(np.frombuffer(content, np.uint8))
     groups = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
     codes = np.packbits(groups, axis=1) >> 1
-    return codes.tobytes().decode("ascii").translate({ord(c): 0x100 + ord(c) for c in "\0\r<"})
+    packed = codes.tobytes().decode("ascii")
+    return packed.replace("\0", "\u0100").replace("\r", "\u010d").replace("<", "\u013c")
 
 
 def _digest(script: str) -> str:

@@ -797,7 +797,8 @@ def _pulled(
     known, (poses, points) = weights[:, None, None] * by, incidence
     of_points = _summed(points, np.swapaxes(rows.by_point, 1, 2) @ known)
     of_poses = _summed(poses, np.swapaxes(rows.by_pose, 1, 2) @ known)
-    own = np.einsum("kip,kiq->pq", by, known)
+    p = by.shape[2]
+    own = by.reshape(-1, p).T @ known.reshape(-1, p)
     return np.concatenate([*of_points, *of_poses, own])
 
 
