@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.core.store import state_of
 from fgslam.core.types import Features
+from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.build import make_extractor
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -84,6 +87,25 @@ def test_frames_too_far_apart_to_carry_anything_are_left_to_features_in_all_imag
     run = run_values(values, tmp_path / "run")
     assert images == [1, 3]
     assert metrics_of(run.folder)["status_counts"] == {"first": 1, "ok": 1}
+
+
+def test_features_of_a_likely_key_frame_are_found_in_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every sixth frame: each is a key frame, so after two in a row the next is expected to be."""
+    begun: list[bool] = []
+    extract = SiftExtractor.extract
+
+    def noted(self: SiftExtractor, image: Image) -> Features:
+        begun.append(threading.current_thread() is not threading.main_thread())
+        return extract(self, image)
+
+    monkeypatch.setattr(SiftExtractor, "extract", noted)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    values = values_of(write_recording(tmp_path / "recording", 24, top=False))
+    values["dataset"] |= {"stride": 6}
+    run_values(values, tmp_path / "run")
+    assert begun == [False, False, True, True]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bytes(

@@ -61,7 +61,7 @@ class KeyFrameTracker:
         self._carrier = carrier
         self._count = 0  # landmarks of the last key frame
         self._cells = 0  # of the image that they covered
-        self._left: tuple[int, ...] = (0,)  # of them, in it and the last frames since, two at most
+        self._left: tuple[int, ...] = (0, 0)  # of them, in the last two frames
         self._again = False  # whether it came right after another
 
     @property
