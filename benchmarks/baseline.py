@@ -13,12 +13,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fgslam.evaluation.statistics import value_at
-from fgslam.runs.tables import RESULT_COLUMNS
+import pandas
 
 _FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio
 _ONE_IS_BEST = ("nees_", "nis_")
-_WHERE = dict(RESULT_COLUMNS)
 
 
 def deviations(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
@@ -26,12 +24,12 @@ def deviations(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> Iterato
 
     Args:
         baseline: the document of a file.
-        found: numbers of the estimators by title, as in metrics.json.
+        found: means of the estimators by title.
     """
     (expected,) = baseline["runs"].values()
     for title, numbers in expected.items():
         for name, value in numbers.items():
-            now = value_at(found.get(title, {}), _WHERE.get(name, name))
+            now = found.get(title, {}).get(name)
             if now is None:
                 yield True, f"{title}: {name}: {value:.6g} in the baseline, not known now"
             elif abs(now - value) > max(_tolerance(baseline, name) * abs(value), _FLOOR):
@@ -41,12 +39,19 @@ def deviations(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> Iterato
 
 def with_numbers(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
     """The document with the numbers of a comparison in the place of its own."""
-    numbers = {
-        title: {n: value_at(one, _WHERE.get(n, n)) for n in baseline["relative_tolerances"]}
-        for title, one in found.items()
-    }
-    known = {t: {n: v for n, v in one.items() if v is not None} for t, one in numbers.items()}
+    names = baseline["relative_tolerances"]
+    known = {title: {n: one[n] for n in names if n in one} for title, one in found.items()}
     return {**baseline, "runs": dict.fromkeys(baseline["runs"], known)}
+
+
+def read_means(folder: Path) -> dict[str, dict[str, float]]:
+    """Means over the seeds by estimator and column, of what ended well."""
+    table = pandas.read_parquet(folder / "results.parquet")
+    means = table[table["failure"].isna()].groupby("estimator").mean(numeric_only=True)
+    return {
+        str(title): {str(name): float(value) for name, value in own.dropna().items()}
+        for title, own in means.iterrows()
+    }
 
 
 def _tolerance(baseline: Mapping[str, Any], name: str) -> float:
@@ -66,7 +71,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="of the comparison")
     parser.add_argument("file", type=Path, help="the baseline")
     given = parser.parse_args()
-    found = json.loads((given.folder / "metrics.json").read_text(encoding="utf-8"))["estimators"]
+    found = read_means(given.folder)
     baseline = json.loads(given.file.read_text(encoding="utf-8"))
     if given.task == "write":
         text = json.dumps(with_numbers(baseline, found), indent=2, allow_nan=False)

@@ -298,7 +298,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         return
     from fgslam.cli.console import show_parts
     from fgslam.runs.compare import Choice, ate_tables, compare_runs
-    from fgslam.runs.trials import run_trials
+    from fgslam.runs.library import run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), existing_folder(overwrite, resume)

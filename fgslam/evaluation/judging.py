@@ -558,6 +558,9 @@ class MeanInterval:
     probability: float
 
 
+SIGNIFICANT = 0.05
+
+
 @dataclass(frozen=True, slots=True)
 class PairedTest:
     """Values of A minus values of B, pair by pair; smaller is better.
@@ -607,6 +610,32 @@ def paired_test(a: FloatArray, b: FloatArray) -> PairedTest | None:
     ratio = float(a.mean() / b.mean()) if b.mean() != 0.0 else None
     wins, losses = int(np.count_nonzero(a < b)), int(np.count_nonzero(a > b))
     return PairedTest(difference, wins, losses, p_value, ratio)
+
+
+def describe_test(smoother: str, against: str, test: PairedTest) -> str:
+    """The outcome of a smoother against a filter by final ATE, in words."""
+    mean = test.difference
+    lower = mean.mean <= 0.0
+    if test.p_value is None or test.p_value >= SIGNIFICANT:
+        outcome = (
+            f"no difference shown between {smoother} and {against}: better in {test.wins}, worse "
+            f"in {test.losses} of {mean.count} trials"
+        )
+    elif lower:
+        outcome = f"{smoother} beats {against} in {test.wins} of {mean.count} trials"
+    else:
+        outcome = f"{against} beats {smoother} in {test.losses} of {mean.count} trials"
+    interval = "one trial has no interval"
+    if mean.lower is not None and mean.upper is not None:
+        sign = -1.0 if lower else 1.0
+        low, high = sorted((100.0 * sign * mean.lower, 100.0 * sign * mean.upper))
+        interval = f"95 % [{low:.3f}, {high:.3f}]"
+    ratio = "" if test.ratio is None else f", {test.ratio:.2f} times"
+    p_value = "all equal" if test.p_value is None else f"p = {test.p_value:.2g}"
+    return (
+        f"{outcome}; {smoother}'s final ATE is {'lower' if lower else 'higher'} by "
+        f"{100.0 * abs(mean.mean):.3f} cm, {interval}{ratio}; {p_value}"
+    )
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -440,11 +440,25 @@ def judge(
     items = int((dof > 0).sum())
     if items == 0:
         return None
-    total = float(dof.sum())
     informative_runs = sum(bool(run.dof.any()) for run in runs)
     independent = min(items, informative_runs if independent is None else independent)
+    return consistency(float(values.sum()), float(dof.sum()), items, independent, probability)
+
+
+def consistency(
+    squared: float, total: float, items: int, independent: float, probability: float = 0.95
+) -> Consistency:
+    """Sums of normalised errors squared and of their degrees of freedom, held against the band.
+
+    Args:
+        squared: sum of the squares.
+        total: of the degrees of freedom, at least 1.
+        items: how many errors were added.
+        independent: how many of them count as independent, each of average dimension.
+        probability: of the band.
+    """
     lower, upper = chi_square_band(total * independent / items, probability)
-    per_dof = float(values.sum()) / total
+    per_dof = squared / total
     verdict: ConsistencyVerdict = "overconfident" if per_dof > upper else "consistent"
     if per_dof < lower:
         verdict = "conservative"

@@ -44,9 +44,6 @@ if TYPE_CHECKING:
     from fgslam.datasets.omni import OmniRecording
     from fgslam.runs.dense import DenseMap
 
-_GROUND = ("log", "trials", "first_seed")
-"""What a resumed run must find as it was, of its provenance, next to the data set's identity."""
-
 Status: TypeAlias = Literal["finished", "interrupted"]
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
@@ -345,7 +342,7 @@ def require_same(config: Experiment, folder: Path) -> None:
     path = folder / RUN_MARKER
     before = load_experiment(path)
     if before.as_values() != config.as_values():
-        compared = set(before.provenance or {}) & {"run", "trials"}  # not begun by `fgslam run`
+        compared = "run" in (before.provenance or {})  # not begun by `fgslam run`
         command = "" if compared else f" ({resume_command(folder)})"
         raise ConfigError(
             f"{path}: differs from the configuration given; resume with the same one{command} or "
@@ -363,12 +360,11 @@ def require_same_ground(now: Mapping[str, Any], folder: Path) -> None:
             f"{dataset.get('name')}: the recording has changed since {path} was written; restore "
             "it, or start again with --overwrite"
         )
-    for name in _GROUND:
-        if then.get(name) != now.get(name):
-            raise ConfigError(
-                f"{path}: was begun with {name} {then.get(name)}, and now it is {now.get(name)}; "
-                "resume with the same, or start again with --overwrite"
-            )
+    if then.get("log") != now.get("log"):
+        raise ConfigError(
+            f"{path}: was begun with log {then.get('log')}, and now it is {now.get('log')}; "
+            "resume with the same, or start again with --overwrite"
+        )
     before, own = then.get("versions") or {}, versions()
     differing = [name for name in own if name in before and before[name] != own[name]]
     changed = [f"{name} {before[name]} -> {own[name]}" for name in differing]

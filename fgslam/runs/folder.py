@@ -165,6 +165,7 @@ RUN = FolderKind(
             for inner in ("", "compare/", "trials/", "first/")
             for name in _RESULT_FILES.split()
         ),
+        *(f"trials/{name}" for name in ("sweep.yaml", "cases.jsonl", "*.parquet")),
         "**/.*.partial*",
     ),
 )

@@ -23,17 +23,20 @@ from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import is_recording, recognise_layout
+from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsSettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.runs.bare import experiment_of
-from fgslam.runs.config import make_config
-from fgslam.runs.engine import RunResult
-from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.compare import EVERY, Choice, choose, with_estimators
+from fgslam.runs.config import ExperimentConfig, HomingTrialsConfig, load_experiment, make_config
+from fgslam.runs.engine import RunResult, run_task
+from fgslam.runs.folder import RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
-from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
-from fgslam.runs.units import Progress
+from fgslam.runs.sweep import SEED, Axis, Plan, SweepResult, make_plan, read_source, run_sweep
+from fgslam.runs.tasks.homing_replay import open_trials
+from fgslam.runs.units import Progress, Stopped
 from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay, replay as replay_log
@@ -249,6 +252,64 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
     folder = plan.default_folder if out is None else Path(out)
     existing = _checked_existing(existing)
     return run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, progress)
+
+
+def run_trials(
+    source: Path,
+    seeds: int | range,
+    choice: Choice = EVERY,
+    out: Path | None = None,
+    existing: ExistingFolder = "refuse",
+    jobs: int = 1,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+) -> RunResult:
+    """Runs an experiment with several seeds in a row and compares the estimators on each.
+
+    Args:
+        source: an experiment's .yaml, or the run folder of one.
+        seeds: of the trials; or how many, the first one being the configuration's.
+        choice: which estimators, and overrides of theirs and of the experiment.
+        out: folder of the results; None: `trials` in the run folder, or `runs/NAME_trials`.
+        existing: what to do where results are already; `resume` goes on with the trials left.
+        jobs: workers at a time, each with linear algebra on one thread.
+        progress: called after each trial that is done.
+        stopped: True ends the trials; those finished are kept.
+
+    Raises:
+        FgslamError: the experiment has one world of noise only, or cannot be run.
+    """
+    of_run = is_run_folder(source)
+    file = source / RUN_MARKER if of_run else source
+    config = load_experiment(file, choice.of_experiment)
+    if not isinstance(config, ExperimentConfig | HomingTrialsConfig):
+        raise ConfigError(
+            f"{source}: task {config.task_name} has no trials of estimators side by side; "
+            "--trials needs an experiment of SLAM or of the task homing_trials"
+        )
+    worlds = RenderedLabSettings | SimulatedMeasurementsSettings
+    if isinstance(config, ExperimentConfig) and not isinstance(config.dataset, worlds):
+        raise ConfigError(
+            f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "
+            "--trials needs a rendered_lab or simulated_measurements data set"
+        )
+    estimators = choose(config, choice.of_estimators)
+    folder = out or (source / "trials" if of_run else Path("runs") / f"{config.name}_trials")
+    if isinstance(seeds, int):
+        seeds = range(config.seed, config.seed + seeds)
+    if isinstance(config, HomingTrialsConfig):
+        chosen = with_estimators(config, estimators)
+        chosen = chosen.model_copy(update={"trials": len(seeds), "seed": seeds.start})
+        return run_task(open_trials, chosen, folder, existing, progress, stopped, jobs)
+    settings = {
+        key.strip(): (text,) for key, _, text in (one.partition("=") for one in choice.overrides)
+    }
+    if config.map.save is not None:
+        settings["map.save"] = ("null",)
+    axes = (settings | {SEED: tuple(map(str, seeds))}).items()
+    titles = tuple(one.title for one in estimators)
+    plan = Plan((read_source(file),), tuple(Axis(key, texts) for key, texts in axes), titles)
+    return run_sweep(plan, folder, Pool(jobs), existing, None, progress, stopped)
 
 
 def replay(

@@ -3,10 +3,12 @@
 Every combination of values is a case. Each finished case is a line of cases.jsonl, by a digest of
 all that its numbers depend on: so a sweep that is resumed does what is missing. All cases become
 one table, and the table a page: means over the repetitions, and paired tests between variants.
+`fgslam compare --trials` is a sweep of one experiment over seeds.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import math
@@ -25,14 +27,27 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeAlias
 import numpy as np
 import yaml
 
+from fgslam.backend.settings import EstimatorSettings, family_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.files import clear_output_errors, write_text
+from fgslam.core.log import MeasurementLog
+from fgslam.core.threads import one_blas_thread
 from fgslam.core.yaml_text import plain_values
 from fgslam.datasets.settings import SimulatedMeasurementsSettings
-from fgslam.evaluation.judging import MeanInterval, PairedTest, holm, mean_interval, paired_test
-from fgslam.evaluation.statistics import JsonValue, value_at
+from fgslam.evaluation.judging import (
+    SIGNIFICANT,
+    MeanInterval,
+    PairedTest,
+    describe_test,
+    holm,
+    judge_replay,
+    mean_interval,
+    paired_test,
+)
+from fgslam.evaluation.statistics import Consistency, JsonValue, consistency, value_at
 from fgslam.report.content import (
+    UNKNOWN,
     Column,
     Figure,
     Page,
@@ -43,9 +58,16 @@ from fgslam.report.content import (
 )
 from fgslam.runs.bare import bare_experiment
 from fgslam.runs.compare import Choice, choose, with_estimators
-from fgslam.runs.config import Experiment, ExperimentConfig, make_experiment, read_mapping
+from fgslam.runs.config import (
+    Experiment,
+    ExperimentConfig,
+    OutputSettings,
+    make_experiment,
+    read_mapping,
+)
 from fgslam.runs.engine import Opening, RunResult, run_task
 from fgslam.runs.folder import (
+    LOG_FILE,
     METRICS_FILE,
     REPORT_FILE,
     ExistingFolder,
@@ -59,11 +81,14 @@ from fgslam.runs.folder import (
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.run import opener_of
 from fgslam.runs.session import override_texts
-from fgslam.runs.slam_comparison import judged_apart
+from fgslam.runs.slam_comparison import judged_apart, load_truth
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, measured_marks, with_marks
-from fgslam.runs.trials import perform_trial
+from fgslam.runs.tasks.slam import open_slam
+from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.tasks.slam_measurements import open_measured, write_log_and_truth
 from fgslam.runs.units import Progress, Stopped
 from fgslam.runs.workers import NOT_BEGUN, Executor, Failed
+from fgslam.slam.replay import replay
 
 if TYPE_CHECKING:
     import pandas
@@ -393,26 +418,53 @@ def perform_case(case: Case) -> CaseResult | Failed:
     return CaseResult(time.monotonic() - begun, rows)
 
 
-def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[Row]:
+@one_blas_thread()
+def perform_trial(config: ExperimentConfig, estimators: Sequence[EstimatorSettings]) -> list[Row]:
+    """One world of noise, start to end, in a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
+        run, output = Path(scratch) / "run", OutputSettings(False, False, checkpoint_seconds=1e9)
+        alone = config.model_copy(update={"compare": (), "output": output})
+        if config.on_measurements:
+            run.mkdir()
+            write_log_and_truth(run, open_measured(alone))
+        else:
+            run_task(open_slam, alone, run)
+        log = MeasurementLog.load(run / LOG_FILE)
+        truth = load_truth(run, log)
+        arrival = None if config.on_measurements else arrival_of(run)  # these begin in no map
+    rows = []
+    for settings in estimators:
+        answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)
+        judged = judge_replay(answer, truth)
+        # A process of several estimators has no memory of each.
+        metrics = dataclasses.replace(judged.metrics, peak_memory_mb=None)
+        values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
+        numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}
+        for name, errors in judged.nees.items():
+            if name in _POOLED.values():
+                numbers[f"nees_{name}_dof"] = int(errors.dof.sum())
+                numbers[f"nees_{name}_items"] = int((errors.dof > 0).sum())
+        times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
+        rows.append(Row(settings.title, numbers, times))
+    return rows
+
+
+def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterable[Row]:
     if isinstance(config, ExperimentConfig):
-        trial = perform_trial(config, estimators, config.seed)
-        for title, metrics in trial.metrics.items():
-            values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
-            numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}
-            times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
-            yield Row(title, numbers, times)
-        return
+        return perform_trial(config, estimators)
     config = with_estimators(config, estimators) if estimators else config
     with tempfile.TemporaryDirectory(prefix="fgslam-case-") as scratch:
         run = Path(scratch) / "run"
         run_task(opener_of(config), config, run, jobs=1, executor=Executor())
         document = read_metrics(run / METRICS_FILE)
     alone = {name: value for name, value in document.items() if name not in _ABOUT}
+    rows = []
     for title, values in (document.get("estimators") or {"": alone}).items():
         flat = dict(_leaves(values))
         timed = {name for name in flat if set(re.split(r"[._]", name)) & _TIMED}
         numbers = {name: value for name, value in flat.items() if name not in timed}
-        yield Row(title, numbers, {name: flat[name] for name in flat if name in timed})
+        rows.append(Row(title, numbers, {name: flat[name] for name in flat if name in timed}))
+    return rows
 
 
 def _leaves(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, JsonValue]]:
@@ -519,11 +571,12 @@ def _columns(rows: Sequence[Mapping[str, Any]]) -> Columns:
 # --------------------------------------------------------------------------------------------
 # What the table shows: variants, repeated over seeds and experiments, and compared with each other
 
-METRICS = ("ate_final_m", "ate_online_m", "end_error_final_m", "nees_pose_final_per_dof")
+_POOLED = {"nees_pose_final_per_dof": "pose", "nees_landmark_per_dof": "landmark"}
+"""Normalised errors that are pooled over repetitions: column, and what they are of."""
+METRICS = ("ate_final_m", "ate_online_m", "end_error_final_m", "landmark_median_m", *_POOLED)
 """What is shown of a sweep where its table has it; the first one is tested, the smaller better."""
 ALL_PAIRS_OF = 12
 """Variants of which every two are compared; of more each one with the first."""
-SIGNIFICANT = 0.05
 _VARIANTS_SHOWN = 400
 _SERIES_SHOWN = 24
 
@@ -578,18 +631,36 @@ class Findings:
         found = {name: own[metric] for name, own in self.well.groupby("variant", sort=False)}
         return {v: mean_interval(_numbers(found[v])) if v in found else None for v in self.variants}
 
+    def pooled(self, metric: str) -> dict[str, Consistency]:
+        """Of normalised errors, over the repetitions of each variant: each counts as one sample."""
+        names = [metric, f"nees_{_POOLED[metric]}_dof", f"nees_{_POOLED[metric]}_items"]
+        found: dict[str, Consistency] = {}
+        if not {*names} <= {*self.frame}:  # of other tasks
+            return found
+        for name, own in self.well.dropna(subset=names).groupby("variant"):
+            ratios, dof, items = (_numbers(own[column]) for column in names)
+            squared, total = float((ratios * dof).sum()), float(dof.sum())
+            found[str(name)] = consistency(squared, total, int(items.sum()), len(own))
+        return found
+
     @cached_property
-    def comparisons(self) -> list[Comparison]:
-        """Of every two variants, or of each with the first, over the repetitions that both have."""
+    def repetitions(self) -> dict[str, FloatArray]:
+        """The tested metric by variant, repetition by repetition; NaN where it is not known."""
         values = self.well.pivot_table(
             self.metrics[0], [*self.repeated], "variant", dropna=False, sort=False
         )
+        return {name: _numbers(values[name]) for name in self.variants if name in values}
+
+    @cached_property
+    def comparisons(self) -> list[Comparison]:
+        """Of every two variants, or of each with the first, over the repetitions that both have."""
+        values = self.repetitions
         first, *others = self.variants
         every = len(self.variants) <= ALL_PAIRS_OF
         tests = []
         for a, b in combinations(self.variants, 2) if every else ((v, first) for v in others):
             if a in values and b in values:
-                test = paired_test(_numbers(values[a]), _numbers(values[b]))
+                test = paired_test(values[a], values[b])
                 if test is not None and test.difference.count > 1:
                     tests.append((a, b, test))
         corrected = iter(holm([t.p_value for _, _, t in tests if t.p_value is not None]))
@@ -600,6 +671,22 @@ class Findings:
             better = (a if test.difference.mean < 0.0 else b) if differ else ""
             found.append(Comparison(a, b, test, p_value, better))
         return found
+
+    def compare_families(self) -> list[str]:
+        """Each smoother against each filter by final ATE, in words, where only estimators vary."""
+        kinds = dict(self.frame.groupby("variant")["kind"].first()) if "kind" in self.frame else {}
+        if self.metrics[0] != METRICS[0] or len(self.variants) > self.frame[ESTIMATOR].nunique():
+            return []
+        ate, families = self.repetitions, {v: family_of(str(k)) for v, k in kinds.items()}
+        filters = [v for v in ate if families.get(v) == "filter" and np.isfinite(ate[v]).any()]
+        best = min(filters, key=lambda v: float(np.nanmean(ate[v])), default="")
+        sentences = []
+        for smoother, of in product((v for v in ate if families.get(v) == "smoother"), filters):
+            test = paired_test(ate[smoother], ate[of])
+            if test is not None:
+                against = f"{of} (the best filter)" if of == best else of
+                sentences.append(describe_test(smoother, against, test))
+        return sentences
 
 
 def _numbers(column: pandas.Series[Any]) -> FloatArray:
@@ -663,6 +750,7 @@ def summarise(findings: Findings | None, cases: int, done: int, failed: int) -> 
         "smallest mean of {}: {:.4g}, {}".format(metric, *min(means)),
         f"{len(shown)} of {len(findings.comparisons)} paired comparisons differ at p < "
         f"{SIGNIFICANT}, corrected by Holm",
+        *findings.compare_families(),
     )
 
 
@@ -670,15 +758,28 @@ def table_of_means(findings: Findings) -> TextTable:
     """Means of the variants."""
     columns = (
         Column("cases", "repetitions, over seeds and experiments, in which it ended well"),
-        *(Column(name, "mean and 95 % interval by Student's t") for name in findings.metrics),
+        *(
+            Column(name, "pooled over the cases: 1 is right; and its 95 % chi-square band")
+            if name in _POOLED
+            else Column(name, "mean and 95 % interval by Student's t")
+            for name in findings.metrics
+        ),
         Column("failed", "repetitions in which it failed"),
     )
-    means = [findings.means(metric) for metric in findings.metrics]
-    failed = findings.frame.groupby("variant")[FAILURE].count()
+    shown = [
+        {v: _pooled_text(one) for v, one in findings.pooled(metric).items()}
+        if metric in _POOLED
+        else {v: _interval_text(one) for v, one in findings.means(metric).items()}
+        for metric in findings.metrics
+    ]
+    tested, failed = (
+        findings.means(findings.metrics[0]),
+        findings.frame.groupby("variant")[FAILURE].count(),
+    )
     rows = []
     for name in findings.variants[:_VARIANTS_SHOWN]:
-        count = "0" if (tested := means[0][name]) is None else str(tested.count)
-        cells = (count, *(_interval_text(one[name]) for one in means), str(failed[name]))
+        count = "0" if (mean := tested[name]) is None else str(mean.count)
+        cells = (count, *(one.get(name, UNKNOWN) for one in shown), str(failed[name]))
         rows.append((name, cells))
     more = len(findings.variants) - _VARIANTS_SHOWN
     heading = f"Means; {more} more" if more > 0 else "Means"
@@ -715,9 +816,13 @@ def table_of_pairs(findings: Findings) -> TextTable:
 
 def _interval_text(found: MeanInterval | None) -> str:
     if found is None:
-        return "-"
+        return UNKNOWN
     ends = "" if found.lower is None else f"\n[{found.lower:.4g}, {found.upper:.4g}]"
     return f"{found.mean:.4g}{ends}"
+
+
+def _pooled_text(found: Consistency) -> str:
+    return f"{found.per_dof:.4g} {found.verdict}\n[{found.lower:.2f}, {found.upper:.2f}]"
 
 
 def write_sweep_page(

@@ -1,6 +1,6 @@
 """One table of metrics: what metrics.json knows of an estimator, and where it is shown.
 
-A metric is a row of ``_METRICS``: its name in comparison.csv, trials.csv and sweeps, its place in
+A metric is a row of ``_METRICS``: its name in comparison.csv and sweeps, its place in
 metrics.json, and the column of the console's and the page's tables that it stands in.
 """
 
@@ -252,14 +252,6 @@ _METRICS = tuple(Metric(*row) for row in (
        "1 5 20 frames", "ratio", "joint", "of motions over so many frames") for lag in LAGS),
     *((f"within_{k}_sigma", f"within_sigma.{k}", JUDGED, "errors: within|1 2 3 sigma", ".0%",
        "truth", "shares of errors; right are 68, 95 and 99.7 %") for k in (1, 2, 3)),
-    ("trials_ate_final", "intervals.ate_rmse_m", FURTHER, "trials: ATE final cm", "cm3", "truth"),
-    ("trials_ate_online", "intervals_online.ate_rmse_m", FURTHER, "trials: ATE online cm", "cm3",
-     "truth"),
-    ("trials_landmark_median", "intervals.landmark_median_m", FURTHER,
-     "trials: landmarks median cm", "cm2", "landmarks"),
-    ("trials_nees_pose", "nees_pose", FURTHER, "trials: NEES pose", "pooled", "truth"),
-    ("trials_nees_landmark", "nees_landmark", FURTHER, "trials: NEES landmarks", "pooled",
-     "landmarks"),
 ))  # fmt: skip
 RESULT_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == RESULT)
 """What the same measurements give to the byte: column, and where its value is in the metrics."""
@@ -320,30 +312,11 @@ def _ratio(value: float) -> str:
     return f"{value:,.0f}" if value >= 1000.0 else f"{value:.2f}"
 
 
-def _interval(digits: int) -> Callable[[Mapping[str, Any]], str]:
-    def text(found: Mapping[str, Any]) -> str:
-        mean, lower, upper = (found[name] for name in ("mean", "lower", "upper"))
-        ends = ""
-        if lower is not None:
-            ends = f"\n[{100.0 * lower:.{digits}f}, {100.0 * upper:.{digits}f}]"
-        return f"{100.0 * mean:.{digits}f}{ends}"
-
-    return text
-
-
-def _pooled(found: Mapping[str, Any]) -> str:
-    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
-    return f"{_ratio(found['per_dof'])} {found['verdict']}\n{band}"
-
-
 _TEXTS: dict[str, Callable[..., str]] = {
     "cm": lambda metres: f"{100.0 * metres:.2f}",
     "s": lambda milliseconds: f"{milliseconds / 1e3:.2f}",
     "ratio": _ratio,
     "text": str,
-    "cm3": _interval(3),
-    "cm2": _interval(2),
-    "pooled": _pooled,
 }
 
 
@@ -365,11 +338,6 @@ def comparison_tables(name: str, frames: int, values: Mapping[str, Any]) -> tupl
     known = marked(values)
     tables = (_table(h, key, known) for h, key in zip(headings, _TABLES, strict=True))
     return tuple(table for table in tables if table.columns)
-
-
-def trials_table(heading: str, values: Mapping[str, Any]) -> TextTable:
-    """Means over trials with their intervals, by estimator."""
-    return _table(heading, "trials", marked(values))
 
 
 def judged_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:
@@ -406,25 +374,21 @@ def ate_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> TextTable:
 
 
 def write_comparison_csv(
-    path: Path,
-    runs: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]],
-    columns: Sequence[tuple[str, str]] = RESULT_COLUMNS + TIME_COLUMNS,
-    key: str = "run",
+    path: Path, runs: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]]
 ) -> None:
     """Write the table atomically; a value that is not known is an empty cell.
 
     Args:
         path: the file.
         runs: name of each run and its estimators' numbers of metrics.json by title.
-        columns: which, see above.
-        key: heading of the runs' names.
 
     Raises:
         OutputError: the file cannot be written.
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([key, "estimator", *(name for name, _ in columns)])
+    columns = RESULT_COLUMNS + TIME_COLUMNS
+    writer.writerow(["run", "estimator", *(name for name, _ in columns)])
     for run, estimators in runs:
         for title, values in estimators.items():
             found = [value_at(values, where) for _, where in columns]

@@ -38,7 +38,6 @@ from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder, create_folder
 from fgslam.runs.run import run_experiment
 from fgslam.runs.tables import write_comparison_csv
-from fgslam.runs.trials import run_trials
 
 QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
 SILENT = {"pictures": 1, "report": False}
@@ -56,7 +55,6 @@ TASKS = (
     "path_following",
     "compare",
     "compare_homing",
-    "trials",
     "teach",
     "follow",
     "join",
@@ -149,7 +147,7 @@ def values_of(
             },
             "frontend": {"ego_motion": {"dof": 3}},
             "compare": ["odometry", "ekf"],
-            "output": QUIET | {"report": True},  # and that of comparisons and trials of it
+            "output": QUIET | {"report": True},  # and that of comparisons of it
         },
         "localisation": {
             **{k: v for k, v in images.items() if k not in ("compare", "map")},
@@ -217,12 +215,6 @@ def doing(
             return compared("measurements", estimators)
         if task == "compare_homing":
             return compared("homing_trials", Choice(("homing_ekf", "alv")))
-        if task == "trials":
-            path = base / "trials.yaml"
-            path.write_text(yaml.safe_dump(values_of("measurements")))
-            return lambda folder, existing: run_trials(
-                path, range(5, 7), Choice(), folder, existing
-            )
         return lambda folder, existing: run(values_of(task), folder, existing)
 
     return found
@@ -546,18 +538,11 @@ def killed(do: Callable[[], object], most: int) -> None:
             do()
 
 
-def test_trials_and_comparisons_are_resumed_only_on_what_they_were_begun_with(
+def test_comparisons_are_resumed_only_on_what_they_were_begun_with(
     values_of: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Another first seed or another log would make a mixture of two results."""
-    source, logged, out = tmp_path / "trials.yaml", tmp_path / "run", tmp_path / "out"
-    values = values_of("measurements")
-    source.write_text(yaml.safe_dump(values))
-    killed(lambda: run_trials(source, range(5, 7), Choice(), out), 8)
-    with pytest.raises(ConfigError, match="begun with first_seed 5, and now it is 6"):
-        run_trials(source, range(6, 8), Choice(), out, "resume")
-    with pytest.raises(ConfigError, match="begun with trials 2, and now it is 3"):
-        run_trials(source, range(5, 8), Choice(), out, "resume")
+    """Another log would make a mixture of two results."""
+    logged, values = tmp_path / "run", values_of("measurements")
     run(values, logged)
     killed(lambda: compare_runs([logged]), 4)
     other = tmp_path / "other"

@@ -128,10 +128,10 @@ def test_failed_cases_are_told_and_done_again_on_resuming(
 
     real = sweep.perform_trial
 
-    def failing(config: Any, estimators: Any, seed: int) -> Any:
-        if seed == 1:
+    def failing(config: Any, estimators: Any) -> Any:
+        if config.seed == 1:
             raise OSError("no space left on device")
-        return real(config, estimators, seed)
+        return real(config, estimators)
 
     monkeypatch.setattr(sweep, "perform_trial", failing)
     found = do(drive, ["seed=0:3"], tmp_path / "out")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,7 +16,7 @@ from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.log import LandmarkTruth, MeasurementLog, read_landmark_truth, write_landmark_truth
 from fgslam.core.types import LandmarkMap
 from fgslam.evaluation.judging import Answer, seen_often
-from fgslam.evaluation.statistics import EstimatorMetrics, Nees, value_at
+from fgslam.evaluation.statistics import EstimatorMetrics, value_at
 from fgslam.report.content import TextTable
 from fgslam.report.formats import MapPoints
 from fgslam.runs.compare import Choice, all_kinds, choose
@@ -35,7 +33,6 @@ from fgslam.runs.tables import (
     points_from_log,
     write_comparison_csv,
 )
-from fgslam.runs.trials import Trial, compare_families, pool_trials, write_trials
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 
@@ -294,86 +291,6 @@ def test_landmarks_seen_twice_are_not_judged() -> None:
     expected = [k for k in range(count) if (seen == k).sum() >= 3]
     assert judged.ids.tolist() == expected
     assert 0 < len(expected) < count
-
-
-# --------------------------------------------------------------------------------------------
-# Trials
-
-
-def trial(seed: int, filter_ate: float, smoother_ate: float, failure: str = "") -> Trial:
-    more: dict[str, Any] = {"kind": "x", "failure": failure or None}
-    metrics = {
-        "kalman": EstimatorMetrics(ate_rmse_m=filter_ate, more={"kind": "landmark_kalman"}),
-        "worse": EstimatorMetrics(ate_rmse_m=filter_ate + 1.0, more={"kind": "ekf"}),
-        "smooth": EstimatorMetrics(ate_rmse_m=smoother_ate, more=more),
-    }
-    nees = Nees(np.array([6.0, 12.0]), np.array([3, 3]))
-    errors = {t: dict.fromkeys(("pose", "online_pose", "landmark"), nees) for t in metrics}
-    return Trial(seed, metrics, errors)
-
-
-KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}
-
-
-def test_trials_report_which_estimator_is_better() -> None:
-    rows = [trial(k, 0.02 + 0.001 * k, 0.01 + 0.0005 * k) for k in range(8)]
-    first, second = compare_families(rows, KINDS)
-    assert (first.smoother, first.filter, first.best_filter) == ("smooth", "kalman", True)
-    assert not second.best_filter
-    assert first.sentence.startswith("smooth beats kalman (the best filter) in 8 of 8 trials; ")
-    assert "final ATE is lower by 1.175 cm, 95 % [1.0" in first.sentence
-    assert "0.50 times; p = 0.0078" in first.sentence
-    pooled = pool_trials(rows, "kalman", "landmark_kalman")
-    assert value_at(pooled.more, "nees_pose.independent") == 8
-    assert pooled.nees_pose_per_dof == 3.0
-    assert pooled.ate_rmse_m == pytest.approx(0.0235)
-
-
-def test_trials_count_predicted_poses_and_name_synthetic_odometry(tmp_path: Path) -> None:
-    rows = [trial(k, 0.02, 0.01) for k in range(3)]
-    for one in rows:
-        more = {**one.metrics["smooth"].more, "predicted_frames": 2, "frames": 9}
-        one.metrics["smooth"] = dataclasses.replace(one.metrics["smooth"], more=more)
-    guessed = config(odometry={"kind": "synthetic"})
-    (table,) = write_trials(guessed, tmp_path, "finished", rows, KINDS).tables
-    found = list(csv.DictReader((tmp_path / "trials.csv").read_text().splitlines()))
-    assert {row["odometry"] for row in found} == {"synthetic"}
-    assert [row["predicted_frames"] for row in found[:3]] == ["", "", "2"]
-    assert "ground truth" in json.loads((tmp_path / "metrics.json").read_text())["remark"]
-    assert table.heading.startswith("x (synthetic odometry): 3 trials, ")
-    assert [name for name, _ in table.rows] == ["kalman", "worse", "smooth (6 poses predicted)"]
-
-
-@pytest.mark.parametrize(
-    ("rows", "start", "words"),
-    [
-        (
-            [trial(k, 0.01 + 0.001 * k, 0.03) for k in range(8)],
-            "kalman (the best filter) beats smooth in 8 of 8 trials; ",
-            "higher by",
-        ),
-        (
-            [trial(k, 0.02, 0.01 + 0.001 * k) for k in range(3)],
-            "no difference shown between smooth and kalman",
-            "better in 3, worse in 0 of 3 trials",
-        ),
-        ([trial(0, 0.02, 0.01)], "no difference shown", "one trial has no interval"),
-    ],
-)
-def test_the_filter_can_be_better_and_few_trials_show_no_difference(
-    rows: list[Trial], start: str, words: str
-) -> None:
-    sentence = compare_families(rows, KINDS)[0].sentence
-    assert sentence.startswith(start)
-    assert words in sentence
-
-
-def test_a_failed_trial_does_not_count() -> None:
-    rows = [trial(0, 0.02, 0.01), trial(1, 0.02, 0.01), trial(2, 0.02, 0.0001, "frame 2: no")]
-    assert compare_families(rows, KINDS)[0].test.difference.count == 2
-    pooled = pool_trials(rows, "smooth", "isam2")
-    assert pooled.ate_rmse_m == pytest.approx(0.01)
-    assert value_at(pooled.more, "nees_pose.independent") == 2
 
 
 @pytest.mark.parametrize(("kind", "predicted"), [("isam2", 2), ("odometry", 0)])

@@ -23,6 +23,7 @@ from fgslam.runs.sweep import (
     Axis,
     Case,
     CaseResult,
+    Findings,
     Journal,
     Plan,
     Row,
@@ -379,3 +380,93 @@ def test_poses_and_odometry_that_are_not_measured_are_marked_wherever_a_sweep_sh
     write_sweep_page(path, [], {}, found, "")
     text = path.read_text(encoding="utf-8")
     assert f"a ({2 * SEEDS} poses predicted, synthetic odometry)" in text  # the curve of both gates
+
+
+# --------------------------------------------------------------------------------------------
+# Estimators in many worlds of noise
+
+KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}
+
+
+def trials(ate: list[tuple[float, float]], failing: int = -1, **more: Any) -> Findings:
+    """Filters and a smoother in as many worlds; final ATE of the better filter and the smoother."""
+    plan = Plan(
+        (Source("drive", {"name": "drive"}, "drive"),), read_axes([f"seed=0:{len(ate) + 1}"])
+    )
+    nees = {"nees_pose_final_per_dof": 3.0, "nees_pose_dof": 6, "nees_pose_items": 2}
+    found = []
+    for number, (of_filter, of_smoother) in enumerate(ate):
+        rows = []
+        of_all = zip(KINDS.items(), (of_filter, of_filter + 1.0, of_smoother), strict=True)
+        for (title, kind), error in of_all:
+            failed = title == "smooth" and number == failing
+            failure = {"failure": "frame 2: no"} if failed else {}
+            rows.append(
+                Row(title, {"kind": kind, "ate_final_m": error, **nees, **more, **failure}, {})
+            )
+        found.append((number, CaseResult(0.1, tuple(rows))))
+    table = find(make_table(plan, found)[0], plan)
+    assert table is not None
+    return table
+
+
+def test_a_sweep_over_seeds_reports_which_estimator_is_better() -> None:
+    found = trials([(0.02 + 0.001 * k, 0.01 + 0.0005 * k) for k in range(8)])
+    first, second = found.compare_families()
+    assert first.startswith("smooth beats kalman (the best filter) in 8 of 8 trials; ")
+    assert "final ATE is lower by 1.175 cm, 95 % [1.0" in first
+    assert "0.50 times; p = 0.0078" in first
+    assert second.startswith("smooth beats worse in 8 of 8 trials; ")
+    assert summarise(found, 8, 8, 0)[-2:] == (first, second)
+    pooled = found.pooled("nees_pose_final_per_dof")["kalman"]
+    assert (pooled.per_dof, pooled.independent, pooled.items) == (3.0, 8, 16)
+    # 8 samples of 3 degrees of freedom each: chi-square with 24, at 2.5 and 97.5 %.
+    assert pooled.lower == pytest.approx(12.401 / 24, abs=1e-4)
+    assert pooled.upper == pytest.approx(39.364 / 24, abs=1e-4)
+    assert found.means("ate_final_m")["kalman"].mean == pytest.approx(0.0235)
+    cells = dict(table_of_means(found).rows)["kalman"]
+    assert cells[-2] == "3 overconfident\n[0.52, 1.64]"
+
+
+@pytest.mark.parametrize(
+    ("ate", "start", "words"),
+    [
+        (
+            [(0.01 + 0.001 * k, 0.03) for k in range(8)],
+            "kalman (the best filter) beats smooth in 8 of 8 trials; ",
+            "higher by",
+        ),
+        (
+            [(0.02, 0.01 + 0.001 * k) for k in range(3)],
+            "no difference shown between smooth and kalman",
+            "better in 3, worse in 0 of 3 trials",
+        ),
+        ([(0.02, 0.01)], "no difference shown", "one trial has no interval"),
+    ],
+)
+def test_the_filter_can_be_better_and_few_trials_show_no_difference(
+    ate: list[tuple[float, float]], start: str, words: str
+) -> None:
+    sentence = trials(ate).compare_families()[0]
+    assert sentence.startswith(start)
+    assert words in sentence
+
+
+def test_a_failed_trial_is_in_no_test_and_not_pooled() -> None:
+    found = trials([(0.02, 0.01), (0.02, 0.01), (0.02, 0.0001)], failing=2)
+    assert "better in 2, worse in 0 of 2 trials" in found.compare_families()[0]
+    assert found.means("ate_final_m")["smooth"].mean == pytest.approx(0.01)
+    assert found.pooled("nees_pose_final_per_dof")["smooth"].independent == 2
+
+
+def test_trials_name_predicted_poses_and_synthetic_odometry() -> None:
+    found = trials([(0.02, 0.01)] * 3, predicted_frames=2, odometry="synthetic")
+    marks = "(6 poses predicted, synthetic odometry)"
+    assert found.variants == [f"{title} {marks}" for title in KINDS]
+    assert found.compare_families()[0].startswith(f"no difference shown between smooth {marks}")
+
+
+def test_families_are_not_compared_over_different_settings(plan: Plan) -> None:
+    found = find(table_of(plan), plan)
+    assert found is not None
+    assert found.compare_families() == []
