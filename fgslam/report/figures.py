@@ -486,7 +486,6 @@ def _by_height(heights: FloatArray, low: float, high: float) -> dict[str, Any]:
 
 MAX_POINTS = 2_500
 _MAX_POINTS_ALONG = 800  # of each of an estimator's three curves and bands
-_MAX_POINTS_NOISE = 1_000
 _WIDELY = 8.0
 _LEAST_NEES = 1e-9
 _LEAST_MS = 0.05  # of a stage that is drawn, in the mean
@@ -713,25 +712,13 @@ def noise_over_time(data: ReportData) -> Figure:
     titles: list[str] = []
     traces: list[Any] = []
     for title, column, words, unit in _NOISE:
+        dash = "dash" if column == "single_factor" else "solid"
         for i, estimator in enumerate(data.estimators):
             values = estimator.noise.get(column, np.empty(0))
-            if not np.isfinite(values).any():
-                continue
-            if title not in titles:
+            if np.isfinite(values).any() and title not in titles:
                 titles.append(title)
-            rows = thinned(len(values), _MAX_POINTS_NOISE)
-            traces.append(
-                curve(
-                    f"{estimator.title}, {words}",
-                    (estimator.timestamps - data.start)[rows],
-                    values[rows],
-                    colour(i),
-                    width=1.6,
-                    dash="dash" if column == "single_factor" else "solid",
-                    hovertemplate=f"%{{y:.3g}}{unit}",
-                    yaxis=_panel(titles.index(title)),
-                )
-            )
+            style = {"width": 1.6, "dash": dash, "yaxis": _panel(len(titles) - 1)}
+            traces += _over_time(data, i, words, values, unit, **style)
     decades = {title: {"type": "log"} for title in (_ROTATION, _TRANSLATION)}
     axes = {title: decades.get(title, _TO_ZERO) for title in titles}
     has_motion = not data.estimators or {_ROTATION, _TRANSLATION} & set(titles)

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, thinned
 from fgslam.core.bearings import HomingEstimate, HomingTruth
+from fgslam.core.geometry import unit
 from fgslam.evaluation.localisation import Answers
 from fgslam.report.content import (
     GREY,
@@ -239,10 +240,6 @@ _TICK_M = 0.3
 _HOMING_BULK = (2.0, 98.0)
 
 
-def _unit(angle: FloatArray) -> FloatArray:
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
 def _upwards(points: FloatArray) -> FloatArray:
     """Points (..., 2), x ahead and y left, on a page where ahead is up."""
     return np.stack([-points[..., 1], points[..., 0]], axis=-1)
@@ -338,7 +335,7 @@ def _moment(
         ("robot", now.robot, now.covariance[:2, :2], 0),
         ("target", now.target, now.covariance[3:5, 3:5], 1),
     ):
-        ahead = np.array([pose[:2], pose[:2] + _TICK * _unit(pose[2])])
+        ahead = np.array([pose[:2], pose[:2] + _TICK * unit(pose[2])])
         yield line(name, _upwards(ahead), colour(number), 2.0, group=name)
         yield dots(name, _upwards(pose[None, :2]), colour(number), 13.0, "square", legendgroup=name)
         outline = outlines(pose[None, :2], block[None])
@@ -387,8 +384,8 @@ def drive_figure(drive: Drive, heading: str = "The drive, from above") -> Figure
         walls = np.vstack([part for one in drive.outlines for part in (one, gap)])
         traces.append(line("walls", walls, GREY, 1.0))
     places = drive.targets[:, :2]
-    circle = PASS_RADIUS_M * _unit(np.linspace(0.0, 2.0 * np.pi, 25))
-    ticks = np.stack([places, places + _TICK_M * _unit(drive.targets[:, 2])], axis=1)
+    circle = PASS_RADIUS_M * unit(np.linspace(0.0, 2.0 * np.pi, 25))
+    ticks = np.stack([places, places + _TICK_M * unit(drive.targets[:, 2])], axis=1)
     numbers: dict[str, Any] = {"text": [str(i + 1) for i in range(len(places))]}
     numbers |= {"mode": "markers+text", "textposition": "top right", "legendgroup": "targets"}
     traces += [
@@ -406,8 +403,8 @@ def drive_figure(drive: Drive, heading: str = "The drive, from above") -> Figure
     moments = []
     for row in (shown := thinned(len(drive.time), _DRIVE_MOMENTS)).tolist():
         place, leg = drive.poses[row, :2], colour(int(drive.legs[row]))
-        ahead = np.array([place, place + _TICK_M * _unit(drive.poses[row, 2])])
-        home = np.array([place, place + 2.0 * _TICK_M * _unit(drive.headings[row])])
+        ahead = np.array([place, place + _TICK_M * unit(drive.poses[row, 2])])
+        home = np.array([place, place + 2.0 * _TICK_M * unit(drive.headings[row])])
         moments.append(
             [
                 line("robot", ahead, leg, 4.0, group="robot"),

@@ -5,21 +5,26 @@ A frame takes milliseconds: every run draws some.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten, wrap
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.files import replacing
+from fgslam.core.geometry import unit
 from fgslam.core.types import Features
 from fgslam.report.content import bulk_limits, level_axes
 from fgslam.report.results import ReportData
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 ORANGE, SKY, YELLOW, INK = "#E69F00", "#56B4E9", "#F0E442", "#222222"
+VERMILLION, FAINT = "#D55E00", "#DDDDDD"
 _DOT, _RIM = "#8C96A0", "#141414"
 _WHITE = 0.78  # whites become this grey, so that bright marks stand out on windows and posters
 _ALONE_PX, _BESIDE_PX = 1400, 900  # widths of images, alone in a row or not
@@ -272,47 +277,252 @@ class FilmCanvas:
         _put_text(whole, self._plan.words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
         _put_text(whole, title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
         if image is not None:
-            panel = self._with_matches(image, seen)
+            panel, scale = _fitted(image, (_FILM_IMAGE_PX, _FILM_PX[0] - 2 * _HEADING_PX))
+            start, end, new = (scale * (pixels + 0.5) for pixels in seen)
+            _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
+            _draw_dots(panel, end, [_bgr(ORANGE)], 3)
+            _draw_dots(panel, new, [_bgr(YELLOW)], 2)
             whole[_HEADING_PX : _HEADING_PX + len(panel), : panel.shape[1]] = panel
         words = "orange: matched, with its motion; yellow: new landmark"
         _put_text(whole, words, (_MARGIN_PX, _FILM_PX[0] - 16))
         return np.asarray(whole[..., ::-1])
 
-    def _with_matches(self, image: Image, seen: tuple[FloatArray, ...]) -> Image:
-        tall, wide = image.shape[:2]
-        scale = min(_FILM_IMAGE_PX / wide, (_FILM_PX[0] - 2 * _HEADING_PX) / tall)
-        dimmed = _dimmed(image)
-        coloured = (
-            cv2.cvtColor(dimmed, cv2.COLOR_GRAY2BGR) if dimmed.ndim == 2 else dimmed[..., ::-1]
-        )
-        size = round(scale * wide), round(scale * tall)
-        panel: Image = np.asarray(
-            cv2.resize(coloured, size, interpolation=cv2.INTER_AREA), np.uint8
-        )
-        start, end, new = (scale * (pixels + 0.5) for pixels in seen)
-        _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
-        _draw_dots(panel, end, [_bgr(ORANGE)], 3)
-        _draw_dots(panel, new, [_bgr(YELLOW)], 2)
-        return panel
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPicture:
+    """What is shown of a path image.
+
+    Attributes:
+        name: for people.
+        size: columns and rows of its picture.
+        features: (k, 2) pixels of the features that are remembered; NaN where not in view.
+        image: the picture itself; None where only the features are at hand.
+    """
+
+    name: str
+    size: tuple[int, int]
+    features: FloatArray
+    image: Image | None
+
+
+_ROUTE_PX = (720, 1280)  # height and width of a frame
+_SEEN_PX, _REMEMBERED_PX = (740, 540), (460, 260)  # room for the image and the path image
+_SECOND_PX = 800  # column of what stands at the right
+_COMPASS_PX, _COMPASS_RADIUS_PX = (910, 490), 100
+_ROUTE_ROW_PX = 680
+_LINE, _LINES = 26, 5  # letters of a reason in a line
+_MOST_NAMED = 25  # path images whose numbers stand below the route
+
+
+def route_frame(
+    path: Sequence[PathPicture],
+    row: Mapping[str, Any],
+    image: Image | None,
+    lines: tuple[FloatArray, FloatArray],
+    command: str,
+) -> Image:
+    """A route that is followed: image, path image, homing vector, place (720, 1280, 3), R G B.
+
+    Args:
+        path: what is shown of each path image, in order.
+        row: of follow.csv by name of the column; numbers are NaN where they are not known.
+        image: as recorded; None where it cannot be read.
+        lines: (m, 2) pixels along the heading, and along the homing vector; NaN where not in view.
+        command: speed and turning rate, or why there is no homing vector.
+    """
+    canvas = np.full((*_ROUTE_PX, 3), 255, np.uint8)
+    nearest, target = (
+        int(row[column]) if np.isfinite(row[column]) else None
+        for column in ("path_image", "target")
+    )
+    title = f"{row['name']} at {row['time_s']:.1f} s; white: ahead, orange: home"
+    if image is not None:
+        panel, scale = _fitted(image, _SEEN_PX)
+        for points, tint in zip(lines, ("#FFFFFF", ORANGE), strict=True):
+            if len(known := points[np.isfinite(points).all(axis=1)]):
+                _draw_lines(panel, scale * (known[None] + 0.5), [_bgr(tint)])
+        canvas[_HEADING_PX : _HEADING_PX + len(panel), _MARGIN_PX:][:, : panel.shape[1]] = panel
+    _put_text(canvas, title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
+    title = "Path image: not known"
+    if nearest is not None:
+        shown = path[nearest]
+        title = f"Path image {nearest}: {shorten(shown.name, 24, placeholder='...')}"
+        picture = np.zeros(shown.size[::-1], np.uint8) if shown.image is None else shown.image
+        panel, scale = _fitted(picture, _REMEMBERED_PX)
+        if shown.image is None:
+            seen = shown.features[np.isfinite(shown.features).all(axis=1)]
+            _draw_dots(panel, scale * (seen + 0.5), [_bgr(SKY)], 2)
+            title += " (its features)"
+        canvas[_HEADING_PX : _HEADING_PX + len(panel), _SECOND_PX:][:, : panel.shape[1]] = panel
+    _put_text(canvas, title, (_SECOND_PX, 0.65 * _HEADING_PX), weight=700)
+    _draw_compass(canvas, row, command)
+    _draw_place(canvas, nearest, target, row["probability"], len(path))
+    return np.asarray(canvas[..., ::-1])
+
+
+def _draw_compass(canvas: Image, row: Mapping[str, Any], command: str) -> None:
+    """The robot from above, ahead is up: an arrow home with its deviation, and the command."""
+    x, y = _COMPASS_PX
+    cv2.circle(canvas, (x, y), _COMPASS_RADIUS_PX, _bgr(FAINT), 2, cv2.LINE_AA)
+    direction, sigma = np.deg2rad([row["direction_deg"], row["sigma_direction_deg"]]).tolist()
+    if np.isfinite(direction):
+        around = direction + sigma * np.linspace(-1.0, 1.0, 21)
+        rim = np.array([x, y]) - _COMPASS_RADIUS_PX * unit(around)[:, ::-1]
+        wedge = [_fixed(np.vstack([[x, y], rim]))]
+        cv2.fillPoly(canvas, wedge, _bgr("#F8E2B3"), cv2.LINE_AA, _SHIFT)
+        tip = tuple(np.rint(rim[10]).astype(int).tolist())
+        cv2.arrowedLine(canvas, (x, y), tip, _bgr(ORANGE), 4, cv2.LINE_AA, tipLength=0.2)
+    robot = np.array([[x - 10, y + 10], [x + 10, y + 10], [x, y - 16]], np.int32)
+    cv2.fillPoly(canvas, [robot], _bgr(INK), cv2.LINE_AA)
+    _put_text(canvas, "Homing vector, ahead is up", (_SECOND_PX, y - 130), weight=700)
+    lines = [part for line in command.splitlines() for part in wrap(line, _LINE)]
+    if len(lines) > _LINES:
+        lines = [*lines[: _LINES - 1], lines[_LINES - 1] + " ..."]
+    refused = row["refusal"] and row["state"] != "arrived"
+    for k, line in enumerate(lines):
+        at = x + 120, y - 50 + 28 * k
+        _put_text(canvas, line, at, colour=_bgr(VERMILLION if refused else INK))
+
+
+def _draw_place(
+    canvas: Image, nearest: int | None, target: int | None, probability: float, count: int
+) -> None:
+    """The path images in a row; where the robot is, and where it goes next."""
+    room = _ROUTE_PX[1] - 4.0 * _MARGIN_PX
+    columns = 2.0 * _MARGIN_PX + room * (np.arange(count) + 0.5) / max(count, 1)
+    places = np.column_stack([columns, np.full(count, float(_ROUTE_ROW_PX))])
+    _draw_path(canvas, places[[0, -1]], FAINT, 3)
+    _draw_dots(canvas, places, [_bgr(_DOT)], 4)
+    title = "Place: not known"
+    if nearest is not None:
+        _draw_dots(canvas, places[[nearest]], [_bgr(SKY)], 9)
+        title = f"Place: path image {nearest}, probability {100 * probability:.0f} %"
+    if target is not None and target != nearest:
+        ring = round(float(places[target, 0])), _ROUTE_ROW_PX
+        cv2.circle(canvas, ring, 13, _bgr(ORANGE), 3, cv2.LINE_AA)
+        title += f"; next {target}"
+    _put_text(canvas, title, (_MARGIN_PX, _ROUTE_ROW_PX - 40), weight=700)
+    for k in range(0, count, -(-count // _MOST_NAMED)):
+        _put_text(canvas, str(k), (places[k, 0] - 8, _ROUTE_ROW_PX + 34))
+
+
+# ------------------------------------------------------------------------------------------
+# Pictures of homing: matches of two views, tracks, path images side by side
+
+
+def draw_view_matches(
+    path: Path,
+    images: tuple[Image, Image],
+    pixels: tuple[FloatArray, FloatArray],
+    columns: BoolArray,
+    titles: tuple[str, str],
+) -> None:
+    """One picture above the other, each match with a number of its own colour in both.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue.
+        pixels: (n, 2) column and row of the accepted matches in either, from centre to centre.
+        columns: (n,) which are column segments: drawn as bars, the others as rings.
+        titles: above each picture.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    # Neighbours in bearing get neighbouring hues, so that a wrong match stands out.
+    order = np.argsort(np.argsort(pixels[0][:, 0]))
+    colours = _colours(order / max(len(order), 1), cv2.COLORMAP_HSV)
+    bar = np.array([[0.0, -8.0], [0.0, 8.0]])
+    panels = []
+    for image, points, title in zip(images, pixels, titles, strict=True):
+        panel, scale = _fitted(image, _SHEET_PX)
+        for k, place in enumerate(scale * (points + 0.5)):
+            if columns[k]:
+                _draw_lines(panel, (place + bar)[None], [colours[k]])
+            else:
+                cv2.circle(
+                    panel, tuple(np.rint(place).astype(int).tolist()), 5, colours[k], 1, cv2.LINE_AA
+                )
+            _put_text(panel, str(k), (place[0] + 6.0, place[1] - 6.0), 400, colours[k], 11)
+        panels.append(_headed(panel, title, ""))
+    _write(path, np.concatenate(panels))
+
+
+def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], title: str) -> None:
+    """Each point with its trail; those that are new are red.
+
+    Args:
+        path: of the PNG.
+        view: (h, w) grey panorama; its last column is followed by its first.
+        trails: (k, 2) column and row of one point in the last k images, the present one last.
+        title: above it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    panel, scale = _fitted(view, _SHEET_PX)
+    for trail in trails:
+        # Parts between crossings of the seam.
+        seams = np.flatnonzero(np.abs(np.diff(trail[:, 0])) > view.shape[1] / 2.0) + 1
+        for part in np.split(scale * (trail + 0.5), seams):
+            _draw_path(panel, part, YELLOW, 1)
+        tint = SKY if len(trail) > 1 else VERMILLION
+        _draw_dots(panel, scale * (trail[-1:] + 0.5), [_bgr(tint)], 3)
+    _write(path, _headed(panel, title, ""))
+
+
+_SHEET_PX, _SHEET_COLUMNS = (1400, 1400), 4  # room for a picture, or for four in a row
+
+
+def draw_sheet(path: Path, images: Sequence[Image], titles: Sequence[str]) -> None:
+    """Pictures side by side, row after row.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue, of one size; at least one.
+        titles: above each.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    across = min(_SHEET_COLUMNS, len(images))
+    room = _SHEET_PX[0] // across - _MARGIN_PX, _SHEET_PX[1]
+    panels = [
+        np.pad(_headed(_fitted(image, room)[0], title, ""), ((0, 0), (0, _MARGIN_PX), (0, 0)),
+               constant_values=255)
+        for image, title in zip(images, titles, strict=True)
+    ]  # fmt: skip
+    panels += [np.full_like(panels[0], 255)] * (-len(panels) % across)
+    rows = [panels[k : k + across] for k in range(0, len(panels), across)]
+    _write(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
+
+
+# ------------------------------------------------------------------------------------------
+# Panels, marks and texts
 
 
 def _enlarged(image: Image, width: int) -> tuple[Image, float]:
     """The image, dimmed, in blue, green, red at a width near to ``width``; and its scale."""
     scale = max(1.0, float(round(width / image.shape[1])))
-    grey = cv2.resize(_dimmed(image), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8), scale
+    return _scaled(image, scale), scale
 
 
-def _dimmed(image: Image) -> Image:
-    darkest, span = dimmed_range(image)
-    above = np.maximum(image, darkest) - darkest
-    return np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), np.uint8)
+def _fitted(image: Image, room: tuple[int, int]) -> tuple[Image, float]:
+    """The same as large as a room (columns, rows) holds it."""
+    scale = min(room[0] / image.shape[1], room[1] / image.shape[0])
+    return _scaled(image, scale), scale
 
 
-def dimmed_range(image: Image) -> tuple[float, float]:
-    """The level that is shown black, and how far above it white would be."""
+def _scaled(image: Image, scale: float) -> Image:
+    """A grey image, or one in R, G, B, in blue, green, red; dimmed, so that marks stand out."""
     darkest, brightest = np.percentile(image, [0.5, 99.5]).tolist()
-    return darkest, max(brightest - darkest, 32.0) / _WHITE
+    span = max(brightest - darkest, 32.0) / _WHITE
+    above = np.maximum(image, darkest) - darkest
+    dimmed = np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), np.uint8)
+    kind = cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR
+    how = cv2.INTER_CUBIC if scale > 1.0 else cv2.INTER_AREA
+    larger = cv2.resize(cv2.cvtColor(dimmed, kind), None, fx=scale, fy=scale, interpolation=how)
+    return np.asarray(larger, np.uint8)
 
 
 def _bgr(colour: str) -> tuple[int, ...]:
@@ -330,9 +540,16 @@ def _headed(panel: Image, title: str, note: str) -> Image:
     return np.concatenate([head, panel])
 
 
-def _put_text(canvas: Image, text: str, at: tuple[float, float], weight: int = 400) -> None:
+def _put_text(
+    canvas: Image,
+    text: str,
+    at: tuple[float, float],
+    weight: int = 400,
+    colour: tuple[int, ...] = (34, 34, 34),
+    size: int = _TEXT_PX,
+) -> None:
     place = (round(at[0]), round(at[1]))
-    cv2.putText(canvas, text, place, _bgr(INK), cv2.FontFace("sans"), _TEXT_PX, weight)
+    cv2.putText(canvas, text, place, colour, cv2.FontFace("sans"), size, weight)
 
 
 def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]) -> None:
@@ -362,10 +579,11 @@ def _fixed(points: FloatArray) -> npt.NDArray[np.int32]:
     return np.rint((points - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
-def _colours(parts: FloatArray) -> list[tuple[int, ...]]:
-    """Of parts from 0 to 1; without the dark end, which would be lost in shadows."""
-    levels = np.rint(255.0 * (0.3 + 0.7 * parts)).astype(np.uint8).reshape(-1, 1)
-    painted = cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA) if len(levels) else np.empty((0, 3))
+def _colours(parts: FloatArray, table: int = cv2.COLORMAP_PLASMA) -> list[tuple[int, ...]]:
+    """Of parts from 0 to 1; without Plasma's dark end, which would be lost in shadows."""
+    parts = 0.3 + 0.7 * parts if table == cv2.COLORMAP_PLASMA else parts
+    levels = np.rint(255.0 * parts).astype(np.uint8).reshape(-1, 1)
+    painted = cv2.applyColorMap(levels, table) if len(levels) else np.empty((0, 3))
     return [tuple(row) for row in painted.reshape(-1, 3).astype(np.int64).tolist()]
 
 

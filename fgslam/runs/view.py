@@ -42,8 +42,7 @@ from fgslam.report.content import (
     world_position_covariances,
 )
 from fgslam.report.formats import read_ply
-from fgslam.report.overlays import FilmCanvas
-from fgslam.report.pictures import PathPicture, RouteCanvas
+from fgslam.report.overlays import FilmCanvas, PathPicture, route_frame
 from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.config import (
     Experiment,
@@ -219,7 +218,6 @@ def _film_of_following(
         shown.append(PathPicture(name, (camera.width, camera.height), pixels, image))
 
     def frames() -> Iterator[Image]:
-        canvas = RouteCanvas(shown)
         places = {int(number): i for i, number in enumerate(recording.ids)}
         for row in rows:
             image = None
@@ -230,7 +228,7 @@ def _film_of_following(
                 recording.camera.pixels(unit_rays(np.full(len(_BEAM), bearing), _BEAM))
                 for bearing in (0.0, np.deg2rad(row["direction_deg"]))
             )
-            yield canvas.draw(row, image, (ahead, home), command_text(row))
+            yield route_frame(shown, row, image, (ahead, home), command_text(row))
 
     return np.array([row["time_s"] for row in rows]), frames()
 

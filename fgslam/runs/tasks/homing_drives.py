@@ -476,7 +476,7 @@ def bearing_log(record: DriveRecord, homing: HomingLog) -> BearingLog:
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:
     """A picture for each view. Raises OutputError."""
-    from fgslam.report.pictures import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.overlays import draw_view_tracks
 
     pictures = []
     for one in views:
@@ -655,7 +655,7 @@ def _draw(
     tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, folder: Path
 ) -> Picture:
     """The last frame with the paths of its points."""
-    from fgslam.report.pictures import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.overlays import draw_view_tracks
 
     i = len(tracks.frames) - 1
     name, _, points, added, _ = tracks.frames[i]

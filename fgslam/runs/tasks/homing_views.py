@@ -769,7 +769,7 @@ def _draw_pair(
     folder: Path, views: OmniRecording, search: PairSearch, answer: PairAnswer
 ) -> Picture:
     """One pair: its accepted matches on both views."""
-    from fgslam.report.pictures import draw_view_matches
+    from fgslam.report.overlays import draw_view_matches
 
     vector, matches = search.answer(answer.a, answer.b)
     kept, caption = matches.select(np.zeros(len(matches), np.bool_)), "refused"

@@ -187,7 +187,7 @@ def _path_image_table(rows: Sequence[tuple[Any, ...]]) -> TextTable:
 
 def _sheet(folder: Path, recording: OmniRecording, taught: Taught) -> tuple[Picture, ...]:
     """The path images side by side."""
-    from fgslam.report.pictures import draw_sheet  # Matplotlib takes a second
+    from fgslam.report.overlays import draw_sheet
 
     titles = [
         f"{k}: {row.name}" + ("" if row.reason == FULL else f" ({row.reason})")
