@@ -407,8 +407,7 @@ _ORDER_REACH = 3
 that confirm its features."""
 
 _THIRD_VIEWS = 1.0
-"""Such confirmations an inlier, on average, that a link so far needs; `docs/concepts/homing.md` has
-what true and false ones got."""
+"""Such confirmations an inlier, on average, that a link so far needs."""
 
 
 class ThirdViewConsistency:

@@ -563,8 +563,7 @@ def seen_past(places: FloatArray, seen: FloatArray) -> BoolArray:
 
     Near the place in the image something lies behind it, and nothing before it that might hide it.
     That what surrounds a missed landmark is recognised is no evidence: true landmarks are missed in
-    many frames in a row for their scale or direction, while others next to them are not
-    (docs/concepts/maps.md has the numbers).
+    many frames in a row for their scale or direction, while others next to them are not.
 
     Args:
         places: (m, 3) predicted (column, row, disparity) of missed landmarks.
