@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 
 CLEAN = (
+    "docs/concepts",
+    "docs/derivations",
     "fgslam/backend",
     "fgslam/cameras",
     "fgslam/cli",
@@ -47,6 +49,7 @@ WORDS = {
 """What is not written, as a pattern of whole words, and the field's words for it."""
 
 MEANT = {
+    "docs/derivations": r"`doubt`",  # an attribute of answers
     # A bend of the way; the option `looks` of `PathFollower`; reasons in commands.csv.
     "fgslam/homing": r"\b(bends?|looks|matched anew)\b",
     "fgslam/runs": r"\blooks\b",  # where a camera looks; the option of `PathFollower`
