@@ -99,8 +99,6 @@ def show_parts(
 
 
 def _files(result: RunResult) -> Iterator[tuple[str, str]]:
-    if not result.written:
-        return
     if (result.folder / METRICS_FILE).is_file():
         yield "metrics", str(result.folder / METRICS_FILE)
     if (result.folder / REPORT_FILE).is_file():

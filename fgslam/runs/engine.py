@@ -95,7 +95,6 @@ class RunResult:
         notes: what was tolerated, or failed.
         particulars: label and text of further lines: failures, remarks, files to look at.
         failed: an estimator was asked for, and none gave an answer.
-        written: there is a folder with files.
         reached: how far an interrupted run got, in words; may be empty.
         located: frames that were located; None where the task locates none.
         alarms: sentences about what makes it no success.
@@ -109,7 +108,6 @@ class RunResult:
     notes: tuple[str, ...] = ()
     particulars: tuple[tuple[str, str], ...] = ()
     failed: bool = False
-    written: bool = True
     reached: str = ""
     located: LocatedShare | None = None
     alarms: tuple[str, ...] = ()

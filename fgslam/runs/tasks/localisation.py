@@ -7,11 +7,12 @@ a picture, the page. Numbers: queries answered, right, inexact and false ones, e
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from fgslam.core.files import make_subfolder
 from fgslam.core.geometry import congruence, rotate_covariances, transform_to_camera, yaw_pitch_roll
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
-from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import NO_LANDMARKS, Floor, LandmarkMap, Relocalisation, StereoFeatures
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.evaluation.localisation import (
@@ -43,27 +43,29 @@ from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import (
     ExperimentConfig,
     LocalisationConfig,
+    OutputSettings,
     as_task,
     load_config,
     load_experiment,
     make_experiment,
 )
-from fgslam.runs.engine import Context, LocatedShare, Opening, RunResult, Task, provenance_of
-from fgslam.runs.folder import (
-    ExistingFolder,
-    Owner,
-    begin_folder,
-    is_run_folder,
-    write_config,
+from fgslam.runs.engine import (
+    Context,
+    LocatedShare,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    run_task,
 )
+from fgslam.runs.folder import ExistingFolder, is_run_folder, write_config
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.results import PICTURES, number_text, write_document, write_page
 from fgslam.runs.session import drives_of
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.slam_results import true_sights, truth_in_map
-from fgslam.runs.units import Progress, UnitStore
-from fgslam.runs.workers import Executor
+from fgslam.runs.units import Progress, Stopped
 from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_stream, trusted
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
@@ -312,11 +314,15 @@ class LocalisationResult(RunResult):
 def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
     """Opens the recording, and the map where it is there already. Raises FgslamError."""
     given = None if config.map.load is None else open_map(Path(config.map.load))
-    sequence = open_sequence(config.as_experiment(), opening.progress)
+    return _task(config, given, open_sequence(config.as_experiment(), opening.progress))
+
+
+def _task(
+    config: LocalisationConfig, given: GivenMap | None, sequence: ImageSequence
+) -> Task[LocalisationResult]:
     if given is not None:
         require_rig(given.saved, sequence.rig, str(given.path))
-    provenance = _provenance(given, sequence)
-    return Task(provenance, lambda context: _run(config, given, sequence, context))
+    return Task(_provenance(given, sequence), partial(_run, config, given, sequence))
 
 
 def _run(
@@ -333,7 +339,13 @@ def _run(
         write_config(folder, config, _provenance(given, sequence))
     asked = ask_all(config, given, sequence, context)
     subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
-    return result_of(config, folder, asked, sequence.notes, given, subtitle)
+    # Features found otherwise than when the map was made are recognised less often.
+    made_with = settings_of_map(given.saved).get("frontend") or {}
+    other = settings_that_differ(made_with, config.as_values()["frontend"])
+    keys = " and ".join(f"frontend.{name}" for name in other)
+    why = f"{keys} differs from that of the map's drive: fewer features will be recognised"
+    notes = (*([why] if other else []), *sequence.notes)
+    return result_of(config, folder, asked, notes, given, subtitle)
 
 
 def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
@@ -413,13 +425,13 @@ def answers_of(attempts: Sequence[Attempt]) -> Answers:
 
 def result_of(
     config: LocalisationConfig,
-    folder: Path | None,
+    folder: Path,
     asked: Asked,
     notes: Sequence[str],
     given: GivenMap | None = None,
     subtitle: str = "",
 ) -> LocalisationResult:
-    """Sentences and tables of a run; with a folder and its map all files. Raises OutputError."""
+    """Sentences and tables of a run; with its map all files. Raises OutputError."""
     judged = scored(config, asked)
     verdicts = [one.numbers["verdicts"] for one in judged]
     rows = tuple(
@@ -429,7 +441,7 @@ def result_of(
     columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
     result = LocalisationResult(
         config=config,
-        folder=folder or Path(),
+        folder=folder,
         status="finished" if asked.whole else "interrupted",
         lines=tuple(_sentence(config, one) for one in judged),
         tables=(
@@ -437,11 +449,10 @@ def result_of(
             TextTable("verdicts", "Verdicts", "verdict", columns, rows),
         ),
         notes=(*notes, asked.alignment),
-        particulars=() if folder is None else (("queries", str(folder / "localisation.csv")),),
-        written=folder is not None,
+        particulars=(("queries", str(folder / "localisation.csv")),),
         asked=asked,
     )
-    if folder is not None and given is not None:
+    if given is not None:
         write_results(result, judged, given, subtitle)
     return result
 
@@ -633,8 +644,7 @@ class Wanted:
     camera: Path | None = None
 
 
-@one_blas_thread()
-def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) -> LocalisationResult:
+def localize(wanted: Wanted, progress: Progress, stopped: Stopped) -> LocalisationResult:
     """Locates frames of a recording in a map without any prior.
 
     Raises:
@@ -644,28 +654,16 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
     if out is not None and wanted.existing == "refuse" and is_run_folder(out):
         raise OutputError(f"{out} holds a run already; choose another --out, or add --overwrite")
     given = open_map(wanted.map_file)
-    made_with = settings_of_map(given.saved)
-    config = _config_of(wanted, made_with)
-    sequence = _open_wanted(wanted, config, progress)
-    require_rig(given.saved, sequence.rig, str(given.path))
-    # Features found otherwise than when the map was made are recognised less often.
-    other = settings_that_differ(made_with.get("frontend") or {}, config.as_values()["frontend"])
-    notes = list(sequence.notes)
-    if other:
-        keys = " and ".join(f"frontend.{name}" for name in other)
-        notes.insert(
-            0, f"{keys} differs from that of the map's drive: fewer features will be recognised"
-        )
-    with ExitStack() as stack:
-        if out is not None:
-            begin_folder(out, wanted.existing, stack.enter_context(Owner(out)))
-            write_config(out, config, _provenance(given, sequence))
-        loop = (1, progress, stopped, Executor())
-        context = Context(out or Path(), False, UnitStore(None), *loop)
-        asked = ask_all(config, given, sequence, context)
-        subtitle = f"{sequence.name}, in the map {given.path}"
-        result = result_of(config, out, asked, notes, given, subtitle)
-    attempts = asked.attempts
+    config = _config_of(wanted, settings_of_map(given.saved))
+    opener = partial(_open_wanted, wanted, given)
+    with tempfile.TemporaryDirectory(prefix="fgslam-localize-") as scratch:
+        if out is None:
+            out, quiet = Path(scratch) / "run", OutputSettings(pictures=False, report=False)
+            config = config.model_copy(update={"output": quiet})
+        result = run_task(opener, config, out, wanted.existing, progress, stopped)
+    if wanted.out is None:
+        result = dataclasses.replace(result, particulars=())
+    attempts = result.asked.attempts
     share = LocatedShare(sum(one.accepted for one in attempts), len(attempts))
     if len(attempts) == 1:
         lines = tuple(f"{name:<18}{value}" for name, value in _details(attempts[0]))
@@ -715,16 +713,18 @@ def _config_of(wanted: Wanted, made_with: Mapping[str, Any]) -> LocalisationConf
     return config.model_copy(update={"dataset": one})
 
 
-def _open_wanted(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
+def _open_wanted(
+    wanted: Wanted, given: GivenMap, config: LocalisationConfig, opening: Opening
+) -> Task[LocalisationResult]:
     frame, where = wanted.frame, "" if wanted.frame is None else f"--frame {wanted.frame}: "
     try:
-        sequence = open_sequence(config.as_experiment(), progress)
+        sequence = open_sequence(config.as_experiment(), opening.progress)
     except FgslamError as error:
         raise type(error)(f"{where}{error}") from None
     if frame is not None and len(sequence) < wanted.frames:
         last = config.dataset.start + (len(sequence) - 1) * config.dataset.stride
         raise ConfigError(f"{where}{sequence.name} ends with frame {last}; choose a smaller one")
-    return sequence
+    return _task(config, given, sequence)
 
 
 def settings_of_map(saved: SavedMap) -> dict[str, Any]:
