@@ -36,7 +36,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 EVERY_FRAME = ("frontend.tracking=sift",)
 """Evidence on SIFT itself, and on landmarks that a miss in each frame judges."""
 
-LOCATED = {EgoMotionStatus.FIRST, EgoMotionStatus.OK, EgoMotionStatus.CAPPED}
+LOCATED = {EgoMotionStatus.FIRST, *(status for status in EgoMotionStatus if status.measured)}
 """How the pose of a frame is found where the map before it tells it."""
 
 _FOLDERS = {

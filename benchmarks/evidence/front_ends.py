@@ -24,7 +24,6 @@ from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.frontend.settings import SiftSettings
 
-ESTIMATOR = "isam2"
 _RAW_EVERY = 5  # frames between those on which SIFT alone is timed
 _NOISE_LEVELS = 8.0
 _DARK = 1.0 / 12.0
@@ -153,7 +152,7 @@ def _row(name: str, rig: CameraRig, shots: Shots, truth: Trajectory) -> tuple[Ce
 def _driven(
     kind: Literal["sift", "hybrid"], rig: CameraRig, shots: Shots, truth: Trajectory, raw: float
 ) -> tuple[Cell, ...]:
-    slam = fg.Slam(rig, ESTIMATOR, frontend={"tracking": kind})
+    slam = fg.Slam(rig, frontend={"tracking": kind})
     start = time.process_time()
     steps = [slam.track(t, images) for t, images in shots]
     spent = time.process_time() - start
