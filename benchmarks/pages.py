@@ -98,7 +98,12 @@ def _of_peers(columns: Mapping[str, Sequence[Cell]]) -> Iterator[tuple[str, ...]
 
 def _both(row: Mapping[str, Cell]) -> str:
     live, end = row["ATE live"], row["ATE end"]
-    return "lost" if live is None else f"{shown(live)}, {shown(end)} m ({row['located']})"
+    if live is None:
+        return "lost"
+    reached = (
+        f"{shown(live)} m, none at the end" if end is None else f"{shown(live)}, {shown(end)} m"
+    )
+    return f"{reached} ({row['located']})"
 
 
 def overview(records: Mapping[str, Sequence[Record]]) -> str:

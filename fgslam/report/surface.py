@@ -8,7 +8,7 @@ on, so that a person who has left is gone. docs/howto/dense_map.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.files import write_bytes, write_text
-from fgslam.core.geometry import inverse, skew
+from fgslam.core.geometry import inverse
 from fgslam.core.open3d_library import load_open3d
 from fgslam.report.formats import (
     AXES,
@@ -244,29 +245,22 @@ class Surface:
         """(n,) of both, metres."""
         return np.asarray(np.hypot(self.voxel_sigmas, self.shared_sigmas))
 
-    def in_axes(self, axes: Axes) -> Surface:
-        """The same, turned from the axes of cameras to those asked for."""
-        if axes == "camera":
-            return self
-        turn = ROS_FROM_CAMERA.T.astype(np.float32)
-        return replace(self, positions=self.positions @ turn, normals=self.normals @ turn)
-
     def save(
         self, path: Path, triangles: bool = False, axes: Axes = "camera", remark: str = ""
     ) -> None:
         """Writes vertices as `.ply` or `.pcd`; a `.ply` also with triangles. OutputError."""
-        found = self.in_axes(axes)
+        turn = np.float32(np.eye(3) if axes == "camera" else ROS_FROM_CAMERA)
         columns = {
-            **dict(zip("xyz", found.positions.T, strict=True)),
-            **dict(zip(("nx", "ny", "nz"), found.normals.T, strict=True)),
-            **dict(zip(("red", "green", "blue"), found.colours.T, strict=True)),
-            "sigma": found.sigmas,
-            "voxel_sigma": found.voxel_sigmas,
+            **dict(zip("xyz", turn @ self.positions.T, strict=True)),
+            **dict(zip(("nx", "ny", "nz"), turn @ self.normals.T, strict=True)),
+            **dict(zip(("red", "green", "blue"), self.colours.T, strict=True)),
+            "sigma": self.sigmas,
+            "voxel_sigma": self.voxel_sigmas,
         }
         elements = {"vertex": as_records(columns)}
         if triangles:
-            corners = {"count": np.full(len(found.triangles), 3, np.uint8)}
-            elements["face"] = as_records({**corners, "vertex_indices": found.triangles})
+            corners = {"count": np.full(len(self.triangles), 3, np.uint8)}
+            elements["face"] = as_records({**corners, "vertex_indices": self.triangles})
         comments = ["fgslam dense map 1", f"axes of the world: {AXES[axes]}, metres", remark]
         require_suffix(path, *(MESH if triangles else CLOUD))
         write_points(path, comments, **elements)
@@ -512,7 +506,5 @@ def _crossed(
 
 def _level_axes(up: FloatArray) -> FloatArray:
     """(3, 3) from axes x forward, y left, z up to those of cameras, by the least turn."""
-    level = ROS_FROM_CAMERA.T
-    axis, cosine = np.cross(level[:, 2], up), float(level[:, 2] @ up)
-    turn = np.eye(3) + skew(axis) + skew(axis) @ skew(axis) / max(1.0 + cosine, 1e-9)
-    return np.asarray(turn @ level)
+    turn = Rotation.align_vectors(up, ROS_FROM_CAMERA[2])[0]
+    return np.asarray(turn.as_matrix() @ ROS_FROM_CAMERA.T)

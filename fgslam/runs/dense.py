@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -37,8 +38,6 @@ from fgslam.runs.units import Progress
 Float16: TypeAlias = npt.NDArray[np.float16]
 Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of a selected frame, grey or in red, green, blue; or FrameError."""
-
-_Read = TypeVar("_Read")
 
 _VOXEL_PX, _FINEST_PX = 3.0, 0.5  # of the image, at the median depth
 _TYPICAL_PX = 0.1  # deviation of a disparity, which bounds how far it is worth to look
@@ -171,9 +170,15 @@ def fuse(
         noise = _TYPICAL_PX / (rig.fx * rig.baseline)
     else:
         measured, farthest, noise = _by_camera(depths, pictures), np.inf, DEPTH_SIGMA_M
+
+    def readable(row: int) -> tuple[Depth, Float32, Image] | None:
+        with suppress(FrameError):
+            return measured(row)
+        return None
+
     some = np.unique(np.linspace(0, len(used) - 1, _SAMPLES).astype(int))
-    found = _readable(measured, [rows[used[k]] for k in some])
-    seen = np.concatenate([np.empty(0, np.float32), *(d[d > 0.0] for d, _, _ in found)])
+    found = [each[0] for k in some if (each := readable(rows[used[k]]))]
+    seen = np.concatenate([np.empty(0, np.float32), *(depth[depth > 0.0] for depth in found)])
     if not len(seen):
         raise DatasetError(
             "the images of this recording show no depth: no pair agrees anywhere; check the "
@@ -191,10 +196,9 @@ def fuse(
     fusion, scans = Fusion(rig.matrix, voxel, most), []
     for done, k in enumerate(used):
         progress("fusing", done, len(used))
-        try:
-            depth, sigma, image = measured(rows[k])
-        except FrameError:
+        if not (each := readable(rows[k])):
             continue
+        depth, sigma, image = each
         wTc = estimate.trajectory.poses[k]
         shared = _shared(log, estimate.covariances[k], depth)
         used_depth = fusion.add(DepthFrame(depth, sigma, image, wTc, shared))
@@ -233,17 +237,6 @@ def readers_of(sequence: ImageSequence) -> tuple[Pictures, Callable[[int], Depth
         return lambda i: sequence.frame(i).images, None
     load, numbers = sequence.load_depth, sequence.indices.tolist()
     return sequence.colour, None if load is None else lambda i: load(numbers[i])
-
-
-def _readable(read: Callable[[int], _Read], rows: Sequence[int]) -> list[_Read]:
-    """What is read of those frames that can be."""
-    found = []
-    for row in rows:
-        try:
-            found.append(read(row))
-        except FrameError:
-            continue
-    return found
 
 
 def _rays(rig: CameraRig) -> Float32:
