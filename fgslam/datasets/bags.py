@@ -54,6 +54,7 @@ from fgslam.datasets.images import (
     both_views,
     images_of_cameras,
     mosaic_note,
+    readable,
     require_size,
 )
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
@@ -380,15 +381,11 @@ class Bag:
         self.size = self._first_size(chosen.right)
 
     def _first_size(self, topic: str) -> tuple[int, int]:
-        fault: FrameError | None = None
-        for place in self.places[topic].tolist():
-            try:
-                height, width = self.image(place).shape
-            except FrameError as error:
-                fault = error
-                continue
+        faults: list[FrameError] = []
+        found = readable(lambda place: self.image(place).shape, self.places[topic].tolist(), faults)
+        for height, width in found:
             return width, height
-        raise DatasetError(f"not one image of {topic} can be read: {fault}")
+        raise DatasetError(f"not one image of {topic} can be read: {faults[-1]}")
 
     def image(self, place: int, colour: bool = False) -> Image:
         """An image in grey, or in red, green, blue where it has colour. Raises FrameError."""

@@ -33,6 +33,7 @@ from fgslam.datasets.images import (
     first_size,
     read_colour_image,
     read_depth_image,
+    readable,
     require_size,
 )
 from fgslam.datasets.layouts import (
@@ -364,12 +365,8 @@ def sample_depths(
     root: Path, count: int, read: Callable[[int], npt.NDArray[Any]], size: tuple[int, int]
 ) -> tuple[FloatArray, bool]:
     """Known depths (n,) of some images, in their own units, and whether these are integers."""
-    images, faults = [], [""]
-    for row in thinned(count, _SAMPLES).tolist():
-        try:
-            images.append(read(row))
-        except FrameError as fault:
-            faults.append(str(fault))
+    faults: list[FrameError] = []
+    images = list(readable(read, thinned(count, _SAMPLES).tolist(), faults))
     if not images:
         raise DatasetError(f"{root}: not one depth image can be read: {faults[-1]}")
     if all(depth.shape != size[::-1] for depth in images):  # a few may be damaged

@@ -121,19 +121,12 @@ def images_of_cameras(
 
 
 def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:
-    images, fault = None, None
-    for frame in paths:
-        try:
-            images = [read_grey_image(path) for path in frame]
-        except FrameError as error:
-            fault = fault or error
-            continue
-        break
-    if images is None:
-        there = all(path.exists() for path in paths[0])
-        why = (
-            f"of the first: {fault}" if there else "check that the file names fit the list of times"
-        )
+    faults: list[FrameError] = []
+    of_frames = readable(lambda frame: [read_grey_image(path) for path in frame], paths, faults)
+    if (images := next(of_frames, None)) is None:
+        why = "check that the file names fit the list of times"
+        if all(path.exists() for path in paths[0]):
+            why = f"of the first: {faults[0]}"
         raise DatasetError(
             f"{where}: not one of {len(paths)} frames has a readable image from each of "
             f"{len(paths[0])} cameras; {why}"
@@ -181,12 +174,16 @@ _P = TypeVar("_P")
 _T = TypeVar("_T")
 
 
-def readable(read: Callable[[_P], _T], places: Iterable[_P]) -> Iterator[_T]:
-    """What is read at those places where nothing is missing or damaged."""
+def readable(
+    read: Callable[[_P], _T], places: Iterable[_P], faults: list[FrameError] | None = None
+) -> Iterator[_T]:
+    """What is read at those places where nothing is missing or damaged; else ``faults`` grows."""
     for place in places:
         try:
             found = read(place)
-        except FrameError:
+        except FrameError as error:
+            if faults is not None:
+                faults.append(error)
             continue
         yield found
 
