@@ -80,18 +80,9 @@ def _distorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
     if not len(plane) or not parameters.any():
         return plane
     within = np.hypot(*plane.T) <= _RADII[_rising(_radial(parameters)) - 1]
-    if len(parameters) == 14 and parameters[12:].any():  # a tilted sensor (Scheimpflug), by OpenCV
-        points = np.column_stack([np.where(within[:, None], plane, 0.0), np.ones(len(plane))])
-        seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), parameters)[0]
-        return _seen(np.asarray(seen, np.float64).reshape(-1, 2), within)
-    k = np.concatenate([parameters, np.zeros(12)])[:12] if len(parameters) < 12 else parameters
-    x, y = np.where(within, plane[:, 0], 0.0), np.where(within, plane[:, 1], 0.0)
-    r2, xy = x * x + y * y, x * y
-    above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-    radial = above / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-    u = x * radial + 2.0 * k[2] * xy + k[3] * (r2 + 2.0 * x * x) + r2 * (k[8] + r2 * k[9])
-    v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * xy + r2 * (k[10] + r2 * k[11])
-    return _seen(np.column_stack([u, v]), within)
+    points = np.column_stack([np.where(within[:, None], plane, 0.0), np.ones(len(plane))])
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), parameters)[0]
+    return _seen(np.asarray(seen, np.float64).reshape(-1, 2), within)
 
 
 def _radial(parameters: FloatArray) -> FloatArray:

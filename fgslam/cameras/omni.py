@@ -401,29 +401,42 @@ class HyperbolicMirror(RadialCamera):
     @classmethod
     def with_view(
         cls,
-        size: tuple[int, int],
+        place: MirrorFrame | tuple[int, int],
         xi: float,
         elevations: tuple[float, float],
+        ring: tuple[float, float] | None = None,
+        focal_px: float | None = None,
         margin_px: float = 0.0,
     ) -> HyperbolicMirror:
-        """A mirror centred in a picture (width, height), whose rim touches the nearest border.
+        """A mirror whose rim touches the nearest border of the picture, unless that is stated.
 
-        ``elevations`` in radians are those at the inner and at the outer rim; ``margin_px`` is left
-        free around the rim.
+        Args:
+            place: where it lies; a size (width, height): in the middle of such a picture.
+            xi: as above.
+            elevations: at the inner and at the outer rim, radians.
+            ring: inner and outer radius in pixels, in place of what follows from these.
+            focal_px: in place of what follows from the outer rim.
+            margin_px: left free around the rim.
         """
         lowest, highest = elevations
         limit = np.arcsin(min(max(xi, 0.0), 1.0))
         if not -np.pi / 2 <= lowest < highest < limit:
             raise CalibrationError(
-                f"hyperbolic mirror: elevations from {np.degrees(lowest):g} to "
-                f"{np.degrees(highest):g} degrees; they must rise from -90 or more, and stay "
-                f"below arcsin(xi) = {np.degrees(limit):.1f}"
+                f"hyperbolic mirror: elevations from {np.degrees(lowest):g} (inner_elevation_deg) "
+                f"to {np.degrees(highest):g} degrees (outer_elevation_deg); they must rise from "
+                f"-90 or more, and stay below arcsin(xi) = {np.degrees(limit):.1f}"
             )
-        outer = (min(size) - 1) / 2.0 - margin_px
-        focal_px = outer * (xi - np.sin(highest)) / np.cos(highest)
-        inner = focal_px * np.cos(lowest) / (xi - np.sin(lowest))
-        frame = MirrorFrame(*size, ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0))
-        return cls(frame, float(inner), outer, xi=xi, focal_px=float(focal_px))
+        if isinstance(place, tuple):
+            place = MirrorFrame(*place, ((place[0] - 1) / 2.0, (place[1] - 1) / 2.0))
+        column, row = place.centre
+        border = min(column, row, place.width - 1 - column, place.height - 1 - row) - margin_px
+        outer = border if ring is None else ring[1]
+        if focal_px is None:
+            focal_px = float(outer * (xi - np.sin(highest)) / np.cos(highest))
+        elif ring is None:
+            outer = float(focal_px * np.cos(highest) / (xi - np.sin(highest)))
+        inner = float(focal_px * np.cos(lowest) / (xi - np.sin(lowest)))
+        return cls(place, *(ring or (inner, outer)), xi=xi, focal_px=focal_px)
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""

@@ -111,7 +111,11 @@ def make_camera(
                 return Equirectangular(*size, float(top), float(bottom))
             return Cylinder(*size, float(np.tan(bottom)), float(np.tan(top)))
         case HyperbolicMirrorSettings():
-            return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
+            frame = _frame(settings, _stated_size("mirror", settings.size, image_size))
+            inner, outer = settings.inner_elevation_deg, settings.outer_elevation_deg
+            view = math.radians(inner), math.radians(outer)
+            given = settings.ring_px, settings.focal_px
+            return HyperbolicMirror.with_view(frame, settings.xi, view, *given)
         case OCamCalibSettings():
             raw, ring = _ocamcalib(_find(settings.file, folder), image_size)
             ring, ahead = settings.ring_px or ring, math.radians(settings.ahead_deg)
@@ -190,25 +194,6 @@ _KINDS: dict[str, type[OmniCameraKind]] = {kind.kind: kind for kind in get_args(
 def _frame(mirror: PlacedMirrorSettings, size: Size) -> MirrorFrame:
     centre = mirror.centre or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
     return MirrorFrame(*size, centre, math.radians(mirror.ahead_deg), mirror.clockwise)
-
-
-def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMirror:
-    frame = _frame(settings, size)
-    lowest = math.radians(settings.inner_elevation_deg)
-    highest = math.radians(settings.outer_elevation_deg)
-    if not lowest < highest or not math.sin(highest) < settings.xi:
-        raise CalibrationError(
-            f"camera: inner_elevation_deg {settings.inner_elevation_deg:g} and outer_elevation_deg "
-            f"{settings.outer_elevation_deg:g} must rise, and stay below arcsin(xi) = "
-            f"{math.degrees(math.asin(settings.xi)):.1f}"
-        )
-    scales = {a: math.cos(a) / (settings.xi - math.sin(a)) for a in (lowest, highest)}
-    column, row = frame.centre
-    border = min(column, row, size[0] - 1 - column, size[1] - 1 - row)
-    focal = settings.focal_px or (settings.ring_px or (0.0, border))[1] / scales[highest]
-    outer = border if settings.focal_px is None else focal * scales[highest]
-    ring = settings.ring_px or (focal * scales[lowest], outer)
-    return HyperbolicMirror(frame, *ring, xi=settings.xi, focal_px=focal)
 
 
 def _ocamcalib(path: Path, size: Size | None) -> tuple[RawCamera, tuple[float, float] | None]:

@@ -180,21 +180,26 @@ def draw_plan(path: Path, data: ReportData) -> None:
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ level.T
     sides = np.diff(bulk_limits(way, dots))[:, 0]
     shape = np.maximum(_ALONE_PX * sides / float(sides.max()), _ALONE_PX // 3)
-    plan = _Plan(way, dots, truth, (round(shape[0]), round(shape[1])))
     title = f"{data.title}: {one.title}, {len(dots):,} landmarks"
+    plan = Plan(way, dots, truth, (round(shape[0]), round(shape[1])), title)
     _write(path, _headed(_headed(plan.drawn(dots, len(way) - 1), plan.words, ""), title, ""))
 
 
-class _Plan:
+class Plan:
     """Path and landmarks from above, drawn again as they grow; ``words`` say what is what."""
 
     def __init__(
-        self, way: FloatArray, dots: FloatArray, truth: FloatArray | None, size: tuple[int, int]
+        self,
+        way: FloatArray,
+        dots: FloatArray,
+        truth: FloatArray | None,
+        size: tuple[int, int],
+        title: str,
     ) -> None:
         """Takes all that will be drawn, metres to the right and ahead, and the size in pixels."""
         limits, (wide, tall) = np.array(bulk_limits(way, dots)), size
         scale = float(np.min(np.array(size) / np.diff(limits)[:, 0]))
-        self._middle, self._scale = limits.mean(axis=1), scale
+        self._middle, self._scale, self.title = limits.mean(axis=1), scale, title
         self._ground = np.full((tall, wide, 3), 255, np.uint8)
         self._way = self._pixels(way)
         self.words = "blue: path; grey: landmarks" + "; black: truth" * (truth is not None)
@@ -235,57 +240,44 @@ def _draw_path(canvas: Image, points: FloatArray, colour: str, thickness: int) -
 # Frames of a film, one after the other
 
 
-class FilmCanvas:
-    """A drive: the image with its matches, next to the growing map."""
+ROOM_PX = _FILM_PX[1] - _FILM_IMAGE_PX - _MARGIN_PX, _FILM_PX[0] - 2 * _HEADING_PX
+"""Width and height of the plan in a frame."""
 
-    def __init__(
-        self, path: FloatArray, landmarks: FloatArray, truth: FloatArray | None, title: str
-    ) -> None:
-        """Takes what does not change.
 
-        Args:
-            path: (n, 2) metres to the right and ahead, of all poses.
-            landmarks: (m, 2) all that will be drawn, for the limits.
-            truth: (k, 2) true path, or None.
-            title: above the map.
-        """
-        tall, wide = _FILM_PX
-        room = wide - _FILM_IMAGE_PX - _MARGIN_PX, tall - 2 * _HEADING_PX
-        self._plan, self._title = _Plan(path, landmarks, truth, room), title
+def film_frame(
+    plan: Plan,
+    image: Image | None,
+    seen: tuple[FloatArray, FloatArray, FloatArray],
+    title: str,
+    known: FloatArray,
+    row: int,
+) -> Image:
+    """A drive: the image with its matches, next to the growing map (540, 1280, 3), R G B.
 
-    def draw(
-        self,
-        image: Image | None,
-        seen: tuple[FloatArray, FloatArray, FloatArray],
-        title: str,
-        known: FloatArray,
-        row: int,
-    ) -> Image:
-        """The frame (540, 1280, 3) in red, green, blue.
-
-        Args:
-            image: what the reference camera saw; None where it cannot be read.
-            seen: pixels (k, 2) of the matched landmarks in the last frame and in this one, and
-                (l, 2) of landmarks seen for the first time.
-            title: above the image.
-            known: (m, 2) landmarks of the map.
-            row: of the present pose.
-        """
-        whole = np.full((*_FILM_PX, 3), 255, np.uint8)
-        plan = _headed(self._plan.drawn(known, row), self._title, "")
-        whole[: len(plan), -plan.shape[1] :] = plan
-        _put_text(whole, self._plan.words, (_FILM_PX[1] - plan.shape[1], len(plan) + 28))
-        _put_text(whole, title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
-        if image is not None:
-            panel, scale = _fitted(image, (_FILM_IMAGE_PX, _FILM_PX[0] - 2 * _HEADING_PX))
-            start, end, new = (scale * (pixels + 0.5) for pixels in seen)
-            _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
-            _draw_dots(panel, end, [_bgr(ORANGE)], 3)
-            _draw_dots(panel, new, [_bgr(YELLOW)], 2)
-            whole[_HEADING_PX : _HEADING_PX + len(panel), : panel.shape[1]] = panel
-        words = "orange: matched, with its motion; yellow: new landmark"
-        _put_text(whole, words, (_MARGIN_PX, _FILM_PX[0] - 16))
-        return np.asarray(whole[..., ::-1])
+    Args:
+        plan: of the whole drive, :data:`ROOM_PX` large.
+        image: what the reference camera saw; None where it cannot be read.
+        seen: pixels (k, 2) of the matched landmarks in the last frame and in this one, and
+            (l, 2) of landmarks seen for the first time.
+        title: above the image.
+        known: (m, 2) landmarks of the map.
+        row: of the present pose.
+    """
+    whole = np.full((*_FILM_PX, 3), 255, np.uint8)
+    above = _headed(plan.drawn(known, row), plan.title, "")
+    whole[: len(above), -above.shape[1] :] = above
+    _put_text(whole, plan.words, (_FILM_PX[1] - above.shape[1], len(above) + 28))
+    _put_text(whole, title, (_MARGIN_PX, 0.65 * _HEADING_PX), weight=700)
+    if image is not None:
+        panel, scale = _fitted(image, (_FILM_IMAGE_PX, _FILM_PX[0] - 2 * _HEADING_PX))
+        start, end, new = (scale * (pixels + 0.5) for pixels in seen)
+        _draw_lines(panel, np.stack([start, end], axis=1), [_bgr(SKY)])
+        _draw_dots(panel, end, [_bgr(ORANGE)], 3)
+        _draw_dots(panel, new, [_bgr(YELLOW)], 2)
+        whole[_HEADING_PX : _HEADING_PX + len(panel), : panel.shape[1]] = panel
+    words = "orange: matched, with its motion; yellow: new landmark"
+    _put_text(whole, words, (_MARGIN_PX, _FILM_PX[0] - 16))
+    return np.asarray(whole[..., ::-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

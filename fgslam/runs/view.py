@@ -42,7 +42,7 @@ from fgslam.report.content import (
     world_position_covariances,
 )
 from fgslam.report.formats import read_ply
-from fgslam.report.overlays import FilmCanvas, PathPicture, route_frame
+from fgslam.report.overlays import ROOM_PX, PathPicture, Plan, film_frame, route_frame
 from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.config import (
     Experiment,
@@ -155,7 +155,7 @@ def _film_of_slam(run: Path, estimator: str | None) -> tuple[FloatArray, Iterato
     plane = level_axes(data.up)[:2]
     above = points.positions @ plane.T
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ plane.T
-    canvas = FilmCanvas(trajectory.poses[:, :3, 3] @ plane.T, above, truth, data.title)
+    plan = Plan(trajectory.poses[:, :3, 3] @ plane.T, above, truth, ROOM_PX, data.title)
 
     def frames() -> Iterator[Image]:
         seen = np.zeros(len(points), np.bool_)
@@ -171,7 +171,7 @@ def _film_of_slam(run: Path, estimator: str | None) -> tuple[FloatArray, Iterato
             images = _readable(pictures, int(frame_at[row]))
             image = None if images is None else images[0]
             shown = before, after, now.measurement[now.is_new, :2]
-            yield canvas.draw(image, shown, title, above[seen], row)
+            yield film_frame(plan, image, shown, title, above[seen], row)
             last = increment
 
     return trajectory.timestamps, frames()
