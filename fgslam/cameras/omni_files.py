@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 
@@ -290,56 +290,20 @@ def _bloggie_values(path: Path) -> dict[str, float]:
 
 
 # --------------------------------------------------------------------------------------------
-# As plain values, for files that name the camera they were made with
+# Of files that hold the camera they were made with
 
 
-_MODELS: dict[str, Any] = {
-    model.__name__: model
-    for model in (Equirectangular, Cylinder, HyperbolicMirror, RadialPolynomial, LensCamera)
-}
+KnownCamera: TypeAlias = (
+    Equirectangular | Cylinder | HyperbolicMirror | RadialPolynomial | LensCamera
+)
+"""All models; a user may have one of his own."""
 
 
-def camera_values(camera: OmniCamera) -> dict[str, Any]:
-    """Model and numbers of a camera, as JSON holds them to the bit.
-
-    Raises:
-        CalibrationError: it is a model of the user's own.
-    """
-    name = type(camera).__name__
-    if _MODELS.get(name) is not type(camera):
-        raise CalibrationError(
-            f"camera: a {name} has no place in files; use one of {', '.join(_MODELS)}"
-        )
-    return {"model": name} | _plain(camera)
-
-
-def camera_of(values: Any, where: str) -> OmniCamera:
-    """The camera of :func:`camera_values`.
-
-    Args:
-        values: as read from a file.
-        where: the file, for messages.
-
-    Raises:
-        CalibrationError: they describe none.
-    """
-    try:
-        given = dict(values)
-        model = _MODELS[given.pop("model")]
-        if isinstance(given.get("frame"), Mapping):
-            given["frame"] = MirrorFrame(**_tuples(given["frame"]))
-        camera: OmniCamera = model(**_tuples(given))
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{where}: its camera is damaged ({error}); write it again"
-        ) from None
-    return camera
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    found = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-    return {name: _plain(one) if name == "frame" else one for name, one in found.items()}
-
-
-def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+def storable(camera: OmniCamera | None) -> KnownCamera | None:
+    """The camera itself. Raises CalibrationError for a model of the user's own."""
+    if camera is None or isinstance(camera, KnownCamera):
+        return camera
+    names = ", ".join(model.__name__ for model in get_args(KnownCamera))
+    raise CalibrationError(
+        f"camera: a {type(camera).__name__} has no place in files; use one of {names}"
+    )

@@ -15,12 +15,11 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fgslam.cameras.omni import OmniCamera
-from fgslam.cameras.omni_files import camera_of, camera_values
+from fgslam.cameras.omni_files import KnownCamera, storable
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import StoredMapError
@@ -409,7 +408,7 @@ class PathMemory:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        return FILE.load(path).memory(str(path))
+        return FILE.load(path).memory()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -418,21 +417,19 @@ class StoredPath:
 
     images: tuple[CoarseFeatures, ...]
     names: tuple[str, ...]
-    camera: dict[str, Any] | None
+    camera: KnownCamera | None
     metric: MetricPoses | None
 
     @staticmethod
     def of(memory: PathMemory) -> StoredPath:
         """The memory, rounded. Raises CalibrationError: the camera is a user's own model."""
-        camera = None if memory.camera is None else camera_values(memory.camera)
         images = tuple(CoarseFeatures.of(image) for image in memory.images)
-        return StoredPath(images, memory.names, camera, memory.metric)
+        return StoredPath(images, memory.names, storable(memory.camera), memory.metric)
 
-    def memory(self, where: str) -> PathMemory:
-        """The memory back; ``where`` names the file."""
-        camera = None if self.camera is None else camera_of(self.camera, where)
+    def memory(self) -> PathMemory:
+        """The memory back."""
         images = tuple(image.features() for image in self.images)
-        return PathMemory(images, self.names, camera, self.metric)
+        return PathMemory(images, self.names, self.camera, self.metric)
 
     def require_sound(self) -> None:
         """Raises ValueError for names or poses of other images, and poses that SLAM cannot find."""
@@ -458,7 +455,7 @@ PACKED = "biufU"
 FILE = FileKind(
     StoredPath,
     "fgslam path memory",
-    version=3,
+    version=4,
     error=StoredMapError,
     give="give a file that holds one, as fgslam teach writes it",
     again="write it again",

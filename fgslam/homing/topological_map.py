@@ -137,7 +137,7 @@ class TopologicalMap:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
         stored = FILE.load(path)
-        memory = stored.places.memory(str(path))
+        memory = stored.places.memory()
         return cls(memory.images, memory.names, stored.links, stored.costs, {}, memory.camera)
 
 
@@ -178,7 +178,7 @@ class _StoredMap:
 FILE = FileKind(
     _StoredMap,
     "fgslam topological map",
-    version=3,
+    version=4,
     error=StoredMapError,
     give="give a file that holds one, as fgslam join writes it",
     again="build it again",
