@@ -18,7 +18,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
+from fgslam.core.geometry import adjoint, congruence, inverse, pose, reorthonormalise, se3_log, skew
 from fgslam.core.sensors import Increment, LoopClosure, Odometry
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, Prediction
@@ -277,11 +277,9 @@ def rigid_motions(twists: FloatArray) -> FloatArray:
     small = angle < _SMALL
     cubed = np.where(small, 1.0, angle) ** 3
     third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (angle - np.sin(angle)) / cubed)
-    out = np.tile(np.eye(4), (len(twists), 1, 1))
-    out[:, :3, :3] += first * cross + second * square
+    rotation = np.eye(3) + (first * cross + second * square)
     along = np.eye(3) + second * cross + third * square
-    out[:, :3, 3] = np.einsum("nij,nj->ni", along, twists[:, 3:])
-    return out
+    return pose(rotation, np.einsum("nij,nj->ni", along, twists[:, 3:]))
 
 
 def as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:

@@ -121,9 +121,9 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Homogeneous (4, 4) matrix of a rotation (3, 3) and a translation (3,)."""
-    out = _EYE4.copy()
-    out[:3, :3], out[:3, 3] = rotation, translation
+    """Homogeneous (..., 4, 4) matrices of rotations (..., 3, 3) and translations (..., 3)."""
+    out = _EYE4.copy() if rotation.ndim == 2 else np.tile(_EYE4, (*rotation.shape[:-2], 1, 1))
+    out[..., :3, :3], out[..., :3, 3] = rotation, translation
     return out
 
 

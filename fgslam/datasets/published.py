@@ -356,11 +356,9 @@ def read_oxts(drive: Path) -> tuple[Trajectory, Table] | None:
 
     latitude, longitude = np.radians(rows[:, [_LATITUDE, _LONGITUDE]]).T
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M  # of the Mercator projection
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
     north = np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
     where = np.column_stack([scale * longitude, scale * north, rows[:, _ALTITUDE]])
-    poses[:, :3, 3] = where - where[0]
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
+    turns = Rotation.from_euler("ZYX", rows[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
     speeds = np.column_stack([found[0], rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
     table = Table(folder, speeds, np.arange(1, len(rows) + 1), SPEED_COLUMNS)
-    return Trajectory(found[0], poses), table
+    return Trajectory(found[0], pose(turns, where - where[0])), table

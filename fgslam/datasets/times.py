@@ -17,7 +17,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, nearest_rows
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines
-from fgslam.core.geometry import rotation_from_quaternion
+from fgslam.core.geometry import pose, rotation_from_quaternion
 from fgslam.core.sides import without_side
 from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import (
@@ -159,10 +159,7 @@ def poses_of(
             f"{table.path}, line {table.lines[k]}: the quaternion has length {norms[k]:.3f}, not 1"
             f"; check the order of the columns ({' '.join(TUM_COLUMNS)})"
         )
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = rotation_from_quaternion(quaternions)
-    poses[:, :3, 3] = positions
-    return poses
+    return pose(rotation_from_quaternion(quaternions), positions)
 
 
 def rows_at(stamps: FloatArray, at: FloatArray, tolerance: float) -> IntArray:

@@ -430,7 +430,7 @@ def write_colmap(folder: Path, model: ImageModel) -> None:
         f"{_CAMERA} PINHOLE {rig.width} {rig.height} {_exact(intrinsics)}",
     ]
     first = np.searchsorted(model.image, np.arange(len(model.names) + 1))
-    iTw = pose_rows(np.array([inverse(wTi) for wTi in model.poses]).reshape(-1, 4, 4))
+    iTw = pose_rows(inverse(model.poses))
     seen = [
         f"{x:.9f} {y:.9f} {point}"
         for (x, y), point in zip(

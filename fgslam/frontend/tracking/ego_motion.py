@@ -590,13 +590,9 @@ def _planar_poses(
     shift_x = there[:, 0] - cosine * here[:, 0] + sine * here[:, 1]
     shift_y = there[:, 1] - sine * here[:, 0] - cosine * here[:, 1]
     e, f = axes[:, 0], axes[:, 1]
-    out = np.zeros((len(cosine), 4, 4))
-    out[:, 3, 3] = 1.0
-    out[:, :3, :3] = np.outer(down, down)
-    out[:, :3, :3] += cosine[:, None, None] * (np.outer(e, e) + np.outer(f, f))
-    out[:, :3, :3] += sine[:, None, None] * (np.outer(f, e) - np.outer(e, f))
-    out[:, :3, 3] = shift_x[:, None] * e + shift_y[:, None] * f
-    return out
+    rotation = np.outer(down, down) + cosine[:, None, None] * (np.outer(e, e) + np.outer(f, f))
+    rotation += sine[:, None, None] * (np.outer(f, e) - np.outer(e, f))
+    return pose(rotation, shift_x[:, None] * e + shift_y[:, None] * f)
 
 
 def align_in_space(here: FloatArray, there: FloatArray) -> FloatArray:
@@ -607,8 +603,4 @@ def align_in_space(here: FloatArray, there: FloatArray) -> FloatArray:
     flip = np.ones((len(here), 3))
     flip[:, 2] = np.sign(np.linalg.det(u @ vt))
     rotation = (u * flip[:, None, :]) @ vt
-    out = np.zeros((len(here), 4, 4))
-    out[:, 3, 3] = 1.0
-    out[:, :3, :3] = rotation
-    out[:, :3, 3] = b_mean - np.einsum("hij,hj->hi", rotation, a_mean)
-    return out
+    return pose(rotation, b_mean - np.einsum("hij,hj->hi", rotation, a_mean))

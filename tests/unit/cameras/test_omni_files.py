@@ -68,7 +68,7 @@ def test_distortion_that_is_not_radial_is_taken_whole(tmp_path: Path, middle: st
     assert bearing == pytest.approx(np.pi / 2, abs=0.01)  # below: the left of what lies right
     assert np.sign(elevation) == (1.0 if middle == "up" else -1.0)
     assert unpack(pack(storable(camera)), KnownCamera) == camera
-    with pytest.raises(CalibrationError, match="a str has no place in files; .*LensCamera"):
+    with pytest.raises(CalibrationError, match=r"a str has no place in files; .*LensCamera"):
         storable("mine")  # type: ignore[arg-type]
 
 
