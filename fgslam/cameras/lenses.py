@@ -511,6 +511,12 @@ def _camera_faults(camera: RawCamera) -> Iterator[str]:
         yield f"focal lengths and lens model show {degrees:.2g} degrees in {shown}"
 
 
+def pixel_grid(size: tuple[int, int]) -> FloatArray:
+    """(width * height, 2) column and row of every pixel, row by row."""
+    columns, rows = np.meshgrid(*(np.arange(length, dtype=float) for length in size))
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
 # --------------------------------------------------------------------------------------------
 # What a calibration file states of several
 

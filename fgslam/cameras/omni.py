@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.lenses import RawCamera, checked_camera
+from fgslam.cameras.lenses import RawCamera, checked_camera, pixel_grid
 from fgslam.cameras.trees import Values
 from fgslam.core.arrays import Float32, FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
@@ -143,11 +143,9 @@ OUTSIDE = -1e4
 
 def unwrap_maps(source: OmniCamera, target: OmniCamera) -> tuple[Float32, Float32]:
     """Columns and rows (target.height, target.width) in the source's image, for a remap."""
-    columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    rays = target.rays(pixels)
+    rays = target.rays(pixel_grid((target.width, target.height)))
     seen = np.isfinite(rays[:, 0])
-    found = np.full((len(pixels), 2), np.nan)
+    found = np.full((len(rays), 2), np.nan)
     found[seen] = source.pixels(rays[seen])
     found = np.where(np.isfinite(found), found, OUTSIDE)
     maps = found.reshape(target.height, target.width, 2).astype(np.float32)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.lenses import Calibration, RawCamera, View
+from fgslam.cameras.lenses import Calibration, RawCamera, View, pixel_grid
 from fgslam.core.arrays import Brief, Float32, FloatArray, Image
 from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
@@ -200,12 +200,6 @@ def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatAr
         else:
             low[axis] = max(low[axis], found.max())
     return low, high
-
-
-def pixel_grid(size: tuple[int, int]) -> FloatArray:
-    """(width * height, 2) column and row of every pixel, row by row."""
-    columns, rows = np.meshgrid(*(np.arange(length, dtype=float) for length in size))
-    return np.column_stack([columns.ravel(), rows.ravel()])
 
 
 def sampling_maps(

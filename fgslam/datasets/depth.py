@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.formats import rgbd_part
-from fgslam.cameras.lenses import RawCamera, View
-from fgslam.cameras.rectify import pixel_grid, sampling_maps
+from fgslam.cameras.lenses import RawCamera, View, pixel_grid
+from fgslam.cameras.rectify import sampling_maps
 from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
 from fgslam.cameras.trees import intrinsic_matrix, read_tree
 from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, thinned

@@ -20,7 +20,7 @@ from fgslam.datasets.images import encoded_png
 from fgslam.datasets.recording import TRUTH_RIGHT
 
 if TYPE_CHECKING:
-    from fgslam.core.arrays import FloatArray, Image
+    from fgslam.core.arrays import Image
     from fgslam.core.log import ImageSequence
 
 
@@ -81,7 +81,11 @@ def _write_lab(folder: Path, progress: Progress) -> None:
             progress("writing", i + 1, len(times))
 
     write_image_folder(folder, sequence.rig, shots())
-    write_poses(folder / "odometry.txt", Trajectory(times, np.stack(list(_body_poses(sequence)))))
+    poses = [np.eye(4)]  # dead reckoning from the first frame
+    for i in range(1, len(times)):
+        moved = sequence.odometry(i)
+        poses.append(poses[-1] if moved is None else poses[-1] @ moved.motion)
+    write_poses(folder / "odometry.txt", Trajectory(times, np.array(poses)))
     if sequence.ground_truth is not None:
         write_poses(folder / TRUTH_RIGHT, sequence.ground_truth)
 
@@ -92,15 +96,6 @@ def lab_sequence() -> ImageSequence:
     from fgslam.worlds.settings import RenderedLabSettings
 
     return RenderedLabSequence(RenderedLabSettings(), 0)
-
-
-def _body_poses(sequence: ImageSequence) -> Iterator[FloatArray]:
-    """Dead reckoning from the first frame."""
-    pose = np.eye(4)
-    for i in range(len(sequence)):
-        moved = sequence.odometry(i) if i else None
-        pose = pose if moved is None else pose @ moved.motion
-        yield pose
 
 
 def _write_house(folder: Path, progress: Progress) -> None:

@@ -25,7 +25,10 @@ from fgslam.worlds.settings import (
 )
 
 Vector3: TypeAlias = tuple[float, float, float]
-FramesASecond: TypeAlias = Annotated[float, Field(gt=0.0, le=1e4)]
+FramesASecond: TypeAlias = Annotated[
+    Annotated[float, Field(gt=0.0, le=1e4)] | None,
+    Field(description="frames a second; null: as stated, else 10"),
+]
 
 # --------------------------------------------------------------------------------------------
 # Images on disk
@@ -82,9 +85,7 @@ class LooseImagesSettings(CalibratedSettings):
 
     path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
     kind: Literal["loose_images"] = "loose_images"
-    fps: FramesASecond | None = Field(
-        default=None, description="frames a second; null: as stated, else 10"
-    )
+    fps: FramesASecond = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -93,9 +94,7 @@ class VideoSettings(CalibratedSettings):
 
     path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
     kind: Literal["video"] = "video"
-    fps: FramesASecond | None = Field(
-        default=None, description="frames a second; null: as stated, else 10"
-    )
+    fps: FramesASecond = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -118,9 +117,7 @@ class RgbdSettings(DepthSettings):
     """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/images.md)."""
 
     kind: Literal["rgbd"] = "rgbd"
-    fps: FramesASecond | None = Field(
-        default=None, description="frames a second; null: as stated, else 10"
-    )
+    fps: FramesASecond = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)

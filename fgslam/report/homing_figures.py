@@ -506,8 +506,7 @@ def network_figure(
     out = plane((*traces, nodes), x=axes[0], y=axes[1])
     if not any(axes):
         out.update_xaxes(showticklabels=False).update_yaxes(showticklabels=False)
-    key, heading, description = words
-    return Figure(f"drive-{key}", heading, description, out)
+    return Figure(f"drive-{words[0]}", *words[1:], out)
 
 
 def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:

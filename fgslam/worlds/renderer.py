@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.lenses import pixel_grid
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, OutputError
@@ -341,8 +342,7 @@ def pinhole_view(shape: tuple[int, int], focal: float, cx: float, cy: float) -> 
 
 def omni_view(camera: OmniCamera) -> View:
     """Any camera with a single viewpoint, axes x forward, y left, z up; distances are ranges."""
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    pixels = pixel_grid((camera.width, camera.height))
     rays = camera.rays(pixels)
     steps = []  # central differences of half a pixel, one-sided at the border of the field
     for step in (np.array([0.5, 0.0]), np.array([0.0, 0.5])):

@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from fgslam.cameras.lenses import pixel_grid
 from fgslam.cameras.omni import (
     Cylinder,
     Equirectangular,
@@ -220,8 +221,7 @@ class UprightSift:
 
     def _seen_mask(self, given: BoolArray | None) -> ByteArray:
         camera = self._camera
-        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+        rays = camera.rays(pixel_grid((camera.width, camera.height)))
         low, high = np.sin(np.deg2rad([MIN_ELEVATION_DEG, MAX_ELEVATION_DEG]))
         with np.errstate(invalid="ignore"):
             seen = (rays[:, 2] >= low) & (rays[:, 2] <= high)
