@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.files import replacing, write_text
+from fgslam.core.files import read_text, replacing, write_text
 from fgslam.core.geometry import congruence
 from fgslam.core.types import Remark
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
@@ -420,9 +420,7 @@ def read_metrics(path: Path) -> dict[str, Any]:
         DatasetError: the file is missing or is not one.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
+        document = json.loads(read_text(path, remedy="check the path"))
     except ValueError as error:
         raise DatasetError(f"{path} is not JSON ({error}); run the experiment again") from error
     if isinstance(document, dict) and document.keys() & {"estimators", "task"}:

@@ -13,10 +13,11 @@ import hashlib
 import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -125,24 +126,14 @@ def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
-@dataclass(frozen=True, slots=True)
-class Embedded:
-    """A picture as it stands in the page, with its size for a steady layout."""
-
-    caption: str
-    uri: str
-    width: int
-    height: int
-
-
-def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
-    """Pictures as data URIs, and a line about each one that could not be shown.
+def embed(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Pictures as data URIs with caption, width and height, and a line about each not shown.
 
     Large ones are made smaller; later ones are left out when the budget of bytes is used up.
     """
     from PIL import Image, UnidentifiedImageError  # what draws no page needs none
 
-    shown: list[Embedded] = []
+    shown: list[dict[str, Any]] = []
     left_out: list[str] = []
     spent = 0
     for picture in pictures:
@@ -166,7 +157,8 @@ def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
             left_out.append(f"{_TOO_MUCH}: {picture.caption}")
         else:
             spent += len(uri)
-            shown.append(Embedded(picture.caption, uri, width, height))
+            size = {"width": width, "height": height}  # for a steady layout
+            shown.append({"caption": picture.caption, "uri": uri} | size)
     return shown, left_out
 
 

@@ -247,10 +247,10 @@ def test_small_pictures_are_kept_and_large_ones_shrunk(rng: np.random.Generator)
     small, large = picture(rng), picture(rng, 2000, 900)
     (kept, shrunk), left_out = embed([Picture("s", small), Picture("l", large)])
     assert left_out == []
-    assert base64.b64decode(kept.uri.partition(",")[2]) == small
-    assert (kept.width, kept.height) == (64, 48)
-    assert shrunk.uri.startswith("data:image/jpeg;base64,")
-    with Image.open(io.BytesIO(base64.b64decode(shrunk.uri.partition(",")[2]))) as opened:
+    assert base64.b64decode(kept["uri"].partition(",")[2]) == small
+    assert (kept["width"], kept["height"]) == (64, 48)
+    assert shrunk["uri"].startswith("data:image/jpeg;base64,")
+    with Image.open(io.BytesIO(base64.b64decode(shrunk["uri"].partition(",")[2]))) as opened:
         assert opened.size == (MAX_WIDTH, 495)
 
 
@@ -266,5 +266,5 @@ def test_pictures_that_cannot_be_shown_are_listed(
     shown, left_out = embed(many)
     assert 0 < len(shown) < 12
     assert len(shown) + len(left_out) == 12
-    assert sum(len(p.uri) for p in shown) < 150_000 * 1.34
+    assert sum(len(p["uri"]) for p in shown) < 150_000 * 1.34
     assert left_out[0] == f"Left out to keep this page small, see the run folder: p{len(shown)}"
