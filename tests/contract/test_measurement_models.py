@@ -15,7 +15,7 @@ from test_estimators import SETTINGS
 
 import fgslam as fg
 from fgslam.backend.measured import RelativePoint
-from fgslam.backend.settings import BatchSettings, Isam2Settings
+from fgslam.backend.settings import BatchSettings, FixedLagSettings, Isam2Settings
 from fgslam.backend.smoothers.bundle import PLAIN, Sightings, WholeGraph
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core.arrays import FloatArray
@@ -152,18 +152,17 @@ def test_isam2_takes_linear_factors_for_those_that_call_back(
 
 
 def test_an_offset_is_found_and_stated_with_its_deviation() -> None:
-    """A window and the filter of single landmarks take it for noise of each measurement."""
+    """The filter of single landmarks takes it for noise of each measurement."""
     world = drive(("position", "offset_range"), frames=60)
     by_odometry = world.ate(fg.replay(world.log, "odometry").estimate)
     for kind in (*ESTIMATORS, "invariant_ekf"):
         found = fg.replay(world.log, kind)
         assert not found.failure
         assert world.ate(found.estimate) < 0.6 * by_odometry
-        if kind != "fixed_lag":
-            (words,) = (one for one in found.estimate.remarks if "nuisance" in one)
-            value, deviation = map(float, re.findall(r"\d\.\d+", words))
-            assert abs(value - OFFSET_M) < 3.0 * deviation
-            assert deviation < (0.5 if kind == "landmark_kalman" else 0.05)
+        (words,) = (one for one in found.estimate.remarks if "nuisance" in one)
+        value, deviation = map(float, re.findall(r"\d\.\d+", words))
+        assert abs(value - OFFSET_M) < 3.0 * deviation
+        assert deviation < (0.5 if kind == "landmark_kalman" else 0.05)
     offset = fg.graph(world.log).values.atVector(nuisance_key("offset_range"))
     np.testing.assert_allclose(offset, [OFFSET_M, 0.0, 0.0], rtol=0.0, atol=0.06)
 
@@ -178,7 +177,8 @@ class ShiftedPoint(RelativePoint):
         return np.tile(np.eye(3)[:, :2], (len(z), 1, 1))
 
 
-def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("kind", ["ekf", "fixed_lag"])
+def test_filter_and_lag_are_batch_on_a_linear_problem(kind: str, rng: np.random.Generator) -> None:
     """Without turns, of positions and of points that are shifted, in the axes of the world."""
     points, stiff = rng.normal(size=(4, 3)), 1.1e-6
     known, noise = np.diag([stiff**2] * 3 + [0.05**2] * 3), 0.04 * np.eye(3)
@@ -193,15 +193,16 @@ def test_ekf_is_batch_on_a_linear_problem(rng: np.random.Generator) -> None:
         ]
         odometry = Odometry(step, known) if k else None
         log.append(Increment.of(k, float(k), odometry, measured))
-    settings = (SETTINGS["ekf"], BatchSettings(noise_factor=1.0))
+    own = {"ekf": SETTINGS["ekf"], "fixed_lag": FixedLagSettings(lag_frames=3)}[kind]
+    settings = (own, BatchSettings(noise_factor=1.0))
     prior = Prediction(np.eye(4), known)
     both = [make_estimator(log.rig, each, prior=prior) for each in settings]
-    ekf, batch = (fg.replay(log, estimator).estimate for estimator in both)
+    found, batch = (fg.replay(log, estimator).estimate for estimator in both)
     for a, b in (
-        (ekf.trajectory.poses[-1], batch.trajectory.poses[-1]),
-        (ekf.covariances[-1], batch.covariances[-1]),
-        (ekf.landmarks.positions, batch.landmarks.positions),
-        (ekf.landmarks.covariances, batch.landmarks.covariances),
+        (found.trajectory.poses[-1], batch.trajectory.poses[-1]),
+        (found.covariances[-1], batch.covariances[-1]),
+        (found.landmarks.positions, batch.landmarks.positions),
+        (found.landmarks.covariances, batch.landmarks.covariances),
     ):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 

@@ -259,6 +259,11 @@ class LandmarkKalman:
         at = self._rows.rows(np.array([-1 - self._nuisances.index(kind)]))[0]
         return self._rows.positions[at], self._rows.covariances[at]
 
+    def know_nuisance(self, kind: str, values: FloatArray, covariance: FloatArray) -> None:
+        """Takes over parameters (3,) that a smoother has found, and their covariance (3, 3)."""
+        at = self._rows.rows(np.array([-1 - self._nuisances.index(kind)]))
+        self._rows.positions[at], self._rows.covariances[at] = values, covariance
+
     def _begin(self, one: Measured) -> None:
         """Landmarks that another sensor's measurements give a place now."""
         if one.of_pose:

@@ -30,7 +30,7 @@ from fgslam.backend.smoothers.elimination import (
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import Damping, adjoint, compose_covariance, congruence, inverse
+from fgslam.core.geometry import Damping, adjoint, compose_covariance, inverse
 from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.factors.graphs import is_landmark, is_pose, landmarks_in, nuisance_key, number
 from fgslam.factors.measurement import (
@@ -106,13 +106,6 @@ class Sightings(Rows):
     def shifted(self) -> FloatArray:
         """(k, m, 3) whitened, by the sensor's nuisance parameters; (k, m, 0) without any."""
         return self.roots @ shifted(self.model, self.measured)
-
-    def considering(self, nuisance: FloatArray, covariance: FloatArray) -> Sightings:
-        """With nuisance parameters (3,) as known, and their covariance (3, 3) as noise of each."""
-        by, root = shifted(self.model, self.measured), np.linalg.inv(self.roots)
-        noise = root @ np.swapaxes(root, 1, 2) + congruence(by, covariance)
-        measured = self.measured - by @ nuisance
-        return dataclasses.replace(self, measured=measured, roots=whitening(noise))
 
     def incidence(self, n: int, m: int) -> tuple[csr_matrix, csr_matrix]:
         """(n, k) and (m, k): which observation is which pose's and which landmark's."""

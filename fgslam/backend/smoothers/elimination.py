@@ -514,6 +514,10 @@ class Eliminated:
         at = (self._r + 6 * np.array(rows)[:, None] + np.arange(6)).ravel()
         return self._covariance[np.ix_(at, at)]
 
+    def hidden_numbers(self, at: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Some of them (k,), and their covariance (k, k)."""
+        return self.corner[at], self._covariance[np.ix_(at, at)]
+
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals of all landmarks."""
         covariance = self._covariance

@@ -11,12 +11,14 @@ measured, as batch's. Derivation: docs/derivations/smoothers.md.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
 
 from fgslam.backend.loops import Chain, Constraint, changes, constraint_factor, nearest_positive
+from fgslam.backend.measured import nuisance_words
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.admission import Track
@@ -100,6 +102,8 @@ class FixedLagSolver:
         self._covariances.append(np.full((6, 6), np.nan))
         self._take(new)
         self._solve()
+        for found in self._nuisances():
+            self._tracker.know_nuisance(*found)
         self._move_window(landmarks)
 
     def recalibrate(self, change: RigChange) -> None:
@@ -162,15 +166,23 @@ class FixedLagSolver:
         inside = [track.variable for _, track in self.builder.admission.in_graph()]
         places = landmarks.points[np.searchsorted(landmarks.variables, inside)]
         found = solved.eliminated.landmarks()[solved.rows(inside)]
+        found_each = self._nuisances()
+        nuisances = (nuisance_words(kind, x, np.diagonal(known)) for kind, x, known in found_each)
         return Solution(
             np.array(self.poses),
             covariances,
             dict(zip(inside, places, strict=True)),
             dict(zip(inside, found, strict=True)),
-            (_NO_MOTIONS,),
+            (_NO_MOTIONS, *nuisances),
         )
 
     # ----------------------------------------------------------------------------------------
+
+    def _nuisances(self) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+        """Of each kind that has any nuisance parameters (3,), as solved, and their covariance."""
+        for kind, one in self.window.measured.items():
+            if len(at := self.window.nuisance(one.model)):
+                yield kind, *self._at_last().eliminated.hidden_numbers(at)
 
     def _take(self, new: NewFactors) -> None:
         """A frame's pose, landmarks and observations into the window."""
@@ -188,8 +200,7 @@ class FixedLagSolver:
             frame, variable, measured, noise = sighting_columns(new.sightings).values()
             self.window.observe(frame, variable, measured, self.builder.noise.power * noise)
         for one in new.measured:
-            nuisance = self._tracker.nuisance(one.model.kind)
-            self.window.measure(one.considering(*nuisance) if nuisance else one)
+            self.window.measure(one)
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""

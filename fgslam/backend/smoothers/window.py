@@ -16,7 +16,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from fgslam.backend.considered import fused, pixels_of
 from fgslam.backend.loops import home_changes, rotated, transported
@@ -56,7 +56,7 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
 from fgslam.factors.landmark import summed, weighed
-from fgslam.factors.measurement import LinearRows, products, whitening
+from fgslam.factors.measurement import LinearRows, nuisance_covariance, products, whitening
 from fgslam.factors.noise import kernel_weights
 
 # ------------------------------------------------------------------------------------------
@@ -82,12 +82,16 @@ class Look:
 
     Residuals are those of the estimate, weights (in the rows) those of where it is linearised.
     ``pulls`` (k, m, 1 + q) are the residuals, then their derivatives by the rig's correction.
+    ``shifted`` (k, m, 3) are those by the sensor's nuisance parameters, where it has any: hidden
+    numbers, of which ``nuisance`` (3,) are the places. Residuals are those without them.
     """
 
     pose: IntArray
     point: IntArray
     rows: LinearRows
     pulls: FloatArray
+    shifted: FloatArray
+    nuisance: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,7 +342,9 @@ class _Off(Rows):
 # ------------------------------------------------------------------------------------------
 # What has left a window of poses and landmarks, as a quadratic over what is still in it
 
-_OPEN = 1e-9  # of a measurement's information: what is left to directions that it leaves open
+_OPEN = 1e-13
+"""Of a measurement's information: what is left to directions that it leaves open. It adds up over
+the drive, and a stiff measurement (a height of 0.1 mm) has 1e8 times the others' information."""
 _UNCOUPLED = 1e-9  # of a landmark's own information: a coupling that changes it by less is none
 
 
@@ -473,6 +479,7 @@ class WindowPrior:
         if rows.residual.shape[1] < 3:  # such a block has no inverse
             own += _OPEN * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         coupling[landmark[:, None], :, at] += np.swapaxes(turned @ rows.by_pose, 1, 2)
+        coupling[:, :, look.nuisance] += summed(landmark, turned @ look.shifted, p)
         return dataclasses.replace(
             self,
             own=self.own + summed(landmark, own, p),
@@ -588,6 +595,7 @@ class Window:
         factors: GTSAM's graph on these poses alone.
         prior: what has left.
         places: where they began, (4, 4): of landmarks that came back, in the order of the prior's.
+            Among them, by their kind, nuisance parameters of a sensor and three unused numbers.
         kernel: around each observation.
     """
 
@@ -604,7 +612,7 @@ class Window:
         self._terms = len(term_names(sensor))
         self._rig_since = 0  # first frame of the rig as it is now
         self.prior = WindowPrior.none(self._terms)
-        self.places: dict[int, FloatArray] = {}
+        self.places: dict[Any, FloatArray] = {}
         self._anchors: dict[int, FloatArray] = {}
         self._shift = np.empty((0, 6))
         self._least_hidden = 0
@@ -636,6 +644,20 @@ class Window:
         frame, variable = seen.poses - pose_key(0), seen.points - landmark_key(0)
         new = dataclasses.replace(seen, poses=frame, points=variable)
         self.measured = by_kind([*self.measured.values(), new])
+        if seen.model.nuisance.size and seen.model.kind not in self.places:
+            self._add_nuisance(seen.model)
+
+    def _add_nuisance(self, model: Any) -> None:
+        """A sensor's nuisance parameters, with what is known of them beforehand."""
+        columns, self.places[model.kind] = self.prior.kept + np.arange(6), np.eye(4)
+        known = block_diag(np.linalg.inv(nuisance_covariance(model)), np.eye(3))
+        self.prior = self.prior.with_place().with_tie(columns, known, np.zeros(6))
+
+    def nuisance(self, model: Any) -> IntArray:
+        """(3,) places of a sensor's nuisance parameters among the hidden numbers; (0,) of none."""
+        if not len(model.nuisance):
+            return _NONE
+        return 6 * list(self.places).index(model.kind) + np.arange(3)
 
     def remeasure(self, change: RigChange) -> None:
         """Corrects the observations of the frames that the change is of, and what has left."""
@@ -744,7 +766,7 @@ class Window:
                 rig = seen.model
                 shift = fused(rig, displacements(rig, pixels_of(rig, seen.measured)))
                 pulls[:, :, 1:] = root[:, None, None] * (seen.roots @ shift)
-        return Look(pose, point, rows, pulls)
+        return Look(pose, point, rows, pulls, seen.shifted(), self.nuisance(seen.model))
 
     def _where_linearised(self) -> tuple[FloatArray, FloatArray]:
         """Poses and points, those on which the prior depends where they were when it first did."""
@@ -760,6 +782,8 @@ class Window:
         n, m, p = len(self.frames), len(self.landmarks.variables), self.prior
         tied, r, weak = self._tied(), p.hidden, self.landmarks
         coupling, own = np.zeros((m, 3, n, 6)), weak.information.copy()
+        hidden = np.zeros((m, 3, r))
+        hidden[tied] = p.coupling
         gradient = products(weak.information, weak.points - weak.mean)
         evaluated = [self.linearise(observed) for observed in self._every]
         for look in evaluated:  # a landmark once a frame by each
@@ -768,6 +792,7 @@ class Window:
             coupling[point, :, pose, :] += turned @ rows.by_pose
             own += summed(point, turned @ rows.by_point, m)
             gradient += summed(point, products(turned, rows.residual), m)
+            hidden[:, :, look.nuisance] += summed(point, turned @ look.shifted, m)
         by = weak.points[tied] - p.points
         own[tied] += p.own
         gradient[tied] += p.gradient[:, :, 0] + products(p.own, by)
@@ -776,8 +801,9 @@ class Window:
         corner += p.corner
         right += p.corner_gradient[:, 0] + p.corner[:, r:] @ self._shift.ravel()
         right[:r] += p.coupling.reshape(by.size, r).T @ by.ravel()
+        tied = np.flatnonzero(hidden.any(axis=(1, 2)))
         return Equations(
-            corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, p.coupling
+            corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, hidden[tied]
         )
 
     @property
@@ -795,6 +821,12 @@ class Window:
             turned = np.swapaxes(rows.by_pose, 1, 2)
             corner[at[:, :, None], at[:, None, :]] += summed(pose, turned @ rows.by_pose, n)
             right[:, at] += np.moveaxis(summed(pose, turned @ look.pulls, n), 2, 0)
+            by, own = np.swapaxes(look.shifted, 1, 2), look.nuisance[:, None]
+            cross = np.moveaxis(summed(pose, by @ rows.by_pose, n), 0, 1).reshape(len(own), 6 * n)
+            corner[own, at.ravel()] += cross
+            corner[at.ravel(), own] += cross
+            corner[own, own.T] += (by @ look.shifted).sum(axis=0)
+            right[:, own[:, 0]] += (by @ look.pulls).sum(axis=0).T
         return corner, right
 
     def _add_factors(
@@ -870,12 +902,12 @@ class Window:
         """Those that count, with residuals as they would be where the derivatives were taken."""
         counts: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
         pose, point, rows = look.pose[counts], look.point[counts], look.rows.select(counts)
-        pulls = look.pulls[counts]
+        pulls, shifted = look.pulls[counts], look.shifted[counts]
         moved = (self.landmarks.points - self._where_linearised()[1])[point]
         residual = rows.residual - products(rows.by_point, moved)
         residual -= products(rows.by_pose, self._shift[pose])
         pulls[:, :, 0] = residual
-        return Look(pose, point, rows, pulls)
+        return Look(pose, point, rows, pulls, shifted, look.nuisance)
 
     def _drop_poses(self, leaving: int) -> None:
         for frame in self.frames[:leaving]:
@@ -946,7 +978,8 @@ class Window:
         """Places on which no landmark depends any more are like any pose that left."""
         for place in list(self.places):
             at = 6 * list(self.places).index(place)
-            if not self.prior.coupling[:, :, at : at + 6].any():
+            left = not self.prior.coupling[:, :, at : at + 6].any()
+            if left and place not in self.measured:
                 self.prior = self.prior.without_place(at)
                 del self.places[place]
 
@@ -970,5 +1003,7 @@ class Window:
         self.landmarks = Landmarks(weak.variables, points, mean, turned)
         self.prior, self._least_hidden = WindowPrior.none(self._terms, len(self.frames)), 0
         self.places = {}
+        for model in (one.model for one in self.measured.values() if one.model.nuisance.size):
+            self._add_nuisance(model)
         self._anchors, self._shift = {}, np.zeros((len(self.frames), 6))
         self.factors.add(prior)
