@@ -782,8 +782,6 @@ class Window:
         n, m, p = len(self.frames), len(self.landmarks.variables), self.prior
         tied, r, weak = self._tied(), p.hidden, self.landmarks
         coupling, own = np.zeros((m, 3, n, 6)), weak.information.copy()
-        hidden = np.zeros((m, 3, r))
-        hidden[tied] = p.coupling
         gradient = products(weak.information, weak.points - weak.mean)
         evaluated = [self.linearise(observed) for observed in self._every]
         for look in evaluated:  # a landmark once a frame by each
@@ -792,7 +790,6 @@ class Window:
             coupling[point, :, pose, :] += turned @ rows.by_pose
             own += summed(point, turned @ rows.by_point, m)
             gradient += summed(point, products(turned, rows.residual), m)
-            hidden[:, :, look.nuisance] += summed(point, turned @ look.shifted, m)
         by = weak.points[tied] - p.points
         own[tied] += p.own
         gradient[tied] += p.gradient[:, :, 0] + products(p.own, by)
@@ -801,10 +798,22 @@ class Window:
         corner += p.corner
         right += p.corner_gradient[:, 0] + p.corner[:, r:] @ self._shift.ravel()
         right[:r] += p.coupling.reshape(by.size, r).T @ by.ravel()
-        tied = np.flatnonzero(hidden.any(axis=(1, 2)))
-        return Equations(
-            corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, hidden[tied]
-        )
+        tied, hidden = self._by_hidden(evaluated)
+        return Equations(corner, right, own, gradient, coupling.reshape(m, 3, 6 * n), tied, hidden)
+
+    def _by_hidden(self, evaluated: list[Look]) -> tuple[IntArray, FloatArray]:
+        """Rows (p,) of landmarks that depend on hidden numbers, and their coupling (p, 3, r)."""
+        tied, coupling = self._tied(), self.prior.coupling
+        for look in evaluated:
+            if len(look.nuisance):
+                every = np.union1d(tied, look.point)
+                more = np.zeros((len(every), *coupling.shape[1:]))
+                more[np.searchsorted(every, tied)] = coupling
+                by = np.swapaxes(look.rows.by_point, 1, 2) @ look.shifted
+                rows = np.searchsorted(every, look.point)
+                more[:, :, look.nuisance] += summed(rows, by, len(every))
+                tied, coupling = every, more
+        return tied, coupling
 
     @property
     def _every(self) -> list[Sightings]:
