@@ -388,6 +388,7 @@ class MatchNoise:
 
 _DRAWN = 4096  # at nine of ten matches wrong, no good triple among them once in 60
 _SAMPLES = 200  # of those that keep their shape
+_AT_ONCE = 512  # judged for that, until there are enough
 _REFINED = 5  # of these; a few noisy depths make a poor pose, whose count means little
 _START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: next to nothing
 _START_SIGMA_M = 5.0
@@ -432,12 +433,13 @@ class Resection:
         return max((int(one.inliers.sum()) for one in self._solutions(rest)), default=0)
 
     def _solutions(self, problem: PoseProblem) -> list[EgoMotion]:
-        """Least squares from each start, but those whose matches a solution explains already."""
+        """Least squares from each start that has a sample of matches which no solution explains."""
         found: list[EgoMotion] = []
         explained: BoolArray = np.zeros((0, len(problem)), np.bool_)
         for start in self._starts(problem):
             agreeing = self._near(start, problem)
-            if not (explained | ~agreeing).all(axis=1).any():
+            new = (agreeing & ~explained).sum(axis=1)
+            if (new >= sample_size(self._solver.floor)).all():
                 found.append(self._solved(start, problem))
                 explained = np.vstack([explained, self._near(found[-1].wTc, problem)])
         return found
@@ -485,8 +487,12 @@ class Resection:
         noise = sensor.triangulation_covariance(
             problem.measurement, problem.measurement_covariance
         ) + rounded(problem.point_covariances)
-        keep = rigid(local[drawn], problem.points[drawn], noise[drawn], self._solver.floor)
-        return np.asarray(drawn[keep if keep.any() else slice(None)][:_SAMPLES])
+        rest, kept = drawn, drawn[:0]
+        while len(rest) and len(kept) < _SAMPLES:
+            some, rest = rest[:_AT_ONCE], rest[_AT_ONCE:]
+            keep = rigid(local[some], problem.points[some], noise[some], self._solver.floor)
+            kept = np.concatenate([kept, some[keep]])
+        return (kept if len(kept) else drawn)[:_SAMPLES]
 
     def _near(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
         """(..., k) matches that poses (..., 4, 4) from a few others agree with."""
