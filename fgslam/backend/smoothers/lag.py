@@ -344,12 +344,15 @@ class SlidingWindowSolver(WholeGraphSolver):
         self.poses: list[FloatArray] = []
         self.drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
         self._sizes: list[float] = []  # m^2, variance of each place
+        self._last_id, self._busy = -1, False  # of the landmarks; with new ones, not twice in a row
 
     # -- a frame -----------------------------------------------------------------------------
 
     def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Keeps a frame for the window's next solution."""
         self._answer = None
+        last, self._last_id = self._last_id, int(landmarks.ids.max(initial=-1))
+        self._busy = self._last_id > last and not self._busy
         self._new.append(new)
         self.poses.append(new.values.atPose3(pose_key(new.frame)).matrix())
         self.drift.append(self.drift[-1] if self.drift else np.zeros((6, 6)))
@@ -360,13 +363,15 @@ class SlidingWindowSolver(WholeGraphSolver):
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Solves the window where the last solution lies `update_every` frames back.
 
-        What a solution leaves to do is done in the frames between, as what they bring.
+        What a solution leaves to do is done in the frames between, as what they bring; not in one
+        with new landmarks, which has enough to do.
         """
         if closes_loop:
             return None
         if frame and frame - self._solved_at < self._settings.update_every:
-            self._let_go()
-            self._take_in()
+            if not self._busy:
+                self._let_go()
+                self._take_in()
             return None
         self._leaving = solved = self._solve()
         if not frame:
