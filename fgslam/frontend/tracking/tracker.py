@@ -121,22 +121,8 @@ class LandmarkTracker:
         anywhere: bool = False,
     ) -> Tracked:
         """Matches in the neighbourhood of ``around``, then solves, stabilised to the prediction."""
-        expected = self.database.expected(landmarks, around.wTc)
-        if anywhere:
-            matches = self._matcher.match_anywhere(expected, features)
-        else:
-            matches = self._match_around(around, expected, landmarks, features)
-        return self.solved(prediction, landmarks, (expected, matches, features))
-
-    def _match_around(
-        self,
-        around: Prediction,
-        expected: ExpectedLandmarks,
-        landmarks: LandmarkMap,
-        features: StereoFeatures,
-    ) -> MapMatches:
-        uncertainty = self._uncertainty(around, landmarks, expected)
-        return self._matcher.match(expected, features, uncertainty)
+        matched = self.matched_around(around, landmarks, features, anywhere)
+        return self.solved(prediction, landmarks, (*matched, features))
 
     def _uncertainty(
         self,
@@ -187,8 +173,7 @@ class LandmarkTracker:
         self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
         """Matches in the neighbourhood of a pose found without a prior, and solves without one."""
-        expected = self.database.expected(landmarks, around.wTc)
-        matches = self._match_around(around, expected, landmarks, features)
+        expected, matches = self.matched_around(around, landmarks, features)
         problem = PoseProblem.of(landmarks, _matched(expected, matches, features))
         return Tracked(expected, matches, self.resection.solve(problem))
 
@@ -325,11 +310,18 @@ class LandmarkTracker:
         return self._ego_motion.image_residuals(wTc, problem) <= farthest
 
     def matched_around(
-        self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
+        self,
+        around: Prediction,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+        anywhere: bool = False,
     ) -> tuple[ExpectedLandmarks, MapMatches]:
-        """Landmarks expected from a pose, and their matches."""
+        """Landmarks expected from a pose, and their matches: near there, or ``anywhere``."""
         expected = self.database.expected(landmarks, around.wTc)
-        return expected, self._match_around(around, expected, landmarks, features)
+        if anywhere:
+            return expected, self._matcher.match_anywhere(expected, features)
+        uncertainty = self._uncertainty(around, landmarks, expected)
+        return expected, self._matcher.match(expected, features, uncertainty)
 
     def merge(self, pairs: IntArray) -> IntArray:
         """Makes landmarks found to be one into one; returns the identities that end.
