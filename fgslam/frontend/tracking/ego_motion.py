@@ -496,8 +496,8 @@ class Resection:
 
     def _near(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
         """(..., k) matches that poses (..., 4, 4) from a few others agree with."""
-        near = _NEAR * self._solver.farthest
-        return np.asarray(self._solver.image_residuals(wTc, problem) <= near)
+        residuals = self._solver.image_residuals(wTc, problem)
+        return np.asarray(residuals <= _NEAR * self._solver.farthest)
 
 
 _RIGID_SIGMAS = 3.0

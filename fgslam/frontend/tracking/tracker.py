@@ -156,10 +156,8 @@ class LandmarkTracker:
         In the wrong place a few dozen matches may agree: some right ones, of things far off or
         close together, and others by chance.
         """
-        found = tracked.ego_motion
-        contradicted = not (found.coherent or self.expects_returns)
-        few = _used(tracked) < _FEW_MATCHED * len(features)
-        return not found.status.measured or contradicted or few
+        found, few = tracked.ego_motion, _used(tracked) < _FEW_MATCHED * len(features)
+        return not (found.status.measured and (found.coherent or self.expects_returns)) or few
 
     def _regained(self, landmarks: LandmarkMap, features: StereoFeatures) -> Tracked | None:
         """The frame found by what was seen lately, without the prediction; None where it is not."""
@@ -292,9 +290,7 @@ class LandmarkTracker:
 
     def track_blind(self, prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
         """The odometry's pose, for a frame without images; the same that its replay will find."""
-        nothing = PoseProblem.empty()
-        found = self._ego_motion.solve(prediction, nothing)
-        return replace(found, status=status)
+        return replace(self._ego_motion.solve(prediction, PoseProblem.empty()), status=status)
 
     def expected(self, prediction: Prediction, landmarks: LandmarkMap) -> ExpectedLandmarks:
         """Landmarks that may be in view of the prediction, as the floor allows it."""
@@ -306,8 +302,7 @@ class LandmarkTracker:
 
     def fits(self, wTc: FloatArray, problem: PoseProblem, slack: float = 1.0) -> BoolArray:
         """Which matches (k,) a pose explains, by ``slack`` times the bound of an inlier."""
-        farthest = slack * self._ego_motion.farthest
-        return self._ego_motion.image_residuals(wTc, problem) <= farthest
+        return self._ego_motion.image_residuals(wTc, problem) <= slack * self._ego_motion.farthest
 
     def matched_around(
         self,
