@@ -174,9 +174,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     final, aligned, first, pose_nees = path_numbers(
         estimate.trajectory, estimate.covariances, estimate.relative
     )
-    online, *_, online_nees = path_numbers(
-        answer.online, answer.online_covariances, estimate.online_relative
-    )
+    online, *_ = path_numbers(answer.online, answer.online_covariances, estimate.online_relative)
     known, compared = of_camera.trajectory, None
     eTt = None if known is None else estimate_from_truth(estimate.trajectory, known)
     if eTt is not None and truth.landmarks is not None:
@@ -217,9 +215,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "truth_remark": sound.why or None,
         },
     )
-    return Judgement(
-        metrics, {"pose": pose_nees, "online_pose": online_nees, "landmark": of_landmarks}
-    )
+    return Judgement(metrics, {"pose": pose_nees, "landmark": of_landmarks})
 
 
 def judge_replay(replay: Outcome, truth: Truth) -> Judgement:

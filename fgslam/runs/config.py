@@ -481,35 +481,31 @@ class ExperimentConfig(Experiment):
 
     def problem(self) -> str:
         """Also contradictions about the map."""
-        return super().problem() or _map_problem(self)
-
-
-def _map_problem(config: ExperimentConfig) -> str:
-    """What is contradictory about the map, with its fix; empty where nothing is."""
-    given, first = config.map, config.map.made_from
-    datasets = (config.dataset, *(() if first is None else (first.dataset,)))
-    measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)
-    as_default = (given.start, given.extend) == ("relocalise", True)
-    problems = {
-        "map: measurements have no appearance to keep; give recordings of images": (
-            measurements and given != MapSettings()
-        ),
-        "map.load and map.made_from exclude each other; give one of them": (
-            first is not None and given.load is not None
-        ),
-        "map.start and map.extend mean nothing without a map; give map.load (--map-in)": (
-            not given.given and not as_default
-        ),
-        "map.extend is false, so there is no new map to save; leave map.save out": (
-            not given.extend and given.save is not None
-        ),
-        "map.load and map.save are one file; save to another name": (
-            given.load is not None
-            and given.save is not None
-            and Path(given.load).resolve() == Path(given.save).resolve()
-        ),
-    }
-    return next((words for words, wrong in problems.items() if wrong), "")
+        given, first = self.map, self.map.made_from
+        datasets = (self.dataset, *(() if first is None else (first.dataset,)))
+        measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)
+        as_default = (given.start, given.extend) == ("relocalise", True)
+        problems = {
+            "map: measurements have no appearance to keep; give recordings of images": (
+                measurements and given != MapSettings()
+            ),
+            "map.load and map.made_from exclude each other; give one of them": (
+                first is not None and given.load is not None
+            ),
+            "map.start and map.extend mean nothing without a map; give map.load (--map-in)": (
+                not given.given and not as_default
+            ),
+            "map.extend is false, so there is no new map to save; leave map.save out": (
+                not given.extend and given.save is not None
+            ),
+            "map.load and map.save are one file; save to another name": (
+                given.load is not None
+                and given.save is not None
+                and Path(given.load).resolve() == Path(given.save).resolve()
+            ),
+        }
+        found = next((words for words, wrong in problems.items() if wrong), "")
+        return super().problem() or found
 
 
 class LocalisationConfig(Experiment):

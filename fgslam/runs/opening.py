@@ -10,7 +10,6 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import with_synthetic_odometry
 from fgslam.datasets.settings import (
     MeasurementDatasetSettings,
-    OdometrySettings,
     RecordedOdometrySettings,
     RenderedLabSettings,
     SyntheticOdometrySettings,
@@ -28,7 +27,19 @@ def open_sequence(config: ExperimentConfig, progress: Progress | None = None) ->
     if isinstance(dataset, RenderedLabSettings):
         from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
-        _require_own_noise(config.odometry)
+        # The rendered robot's odometry has its noise among the data set's keys: no key may be idle.
+        if isinstance(config.odometry, SyntheticOdometrySettings):
+            raise ConfigError(
+                "odometry.kind synthetic is for recordings; the rendered lab has wheels of its "
+                "own: choose recorded or constant_velocity"
+            )
+        if isinstance(config.odometry, RecordedOdometrySettings) and (
+            config.odometry != RecordedOdometrySettings()
+        ):
+            raise ConfigError(
+                "keys of `odometry` other than kind mean nothing to the rendered lab; set the "
+                "noise of its wheels under dataset.odometry"
+            )
         rendered = None if progress is None else partial(progress, "rendering")
         selected = dataset.start, dataset.stop, dataset.stride
         return RenderedLabSequence(dataset, config.seed, *selected, rendered)
@@ -42,19 +53,3 @@ def open_sequence(config: ExperimentConfig, progress: Progress | None = None) ->
     if isinstance(config.odometry, SyntheticOdometrySettings):
         return with_synthetic_odometry(recording, config.odometry, config.seed)
     return recording
-
-
-def _require_own_noise(odometry: OdometrySettings) -> None:
-    """The rendered robot's odometry has its noise among the data set's keys: no key may be idle."""
-    if isinstance(odometry, SyntheticOdometrySettings):
-        raise ConfigError(
-            "odometry.kind synthetic is for recordings; the rendered lab has wheels of its own: "
-            "choose recorded or constant_velocity"
-        )
-    if not isinstance(odometry, RecordedOdometrySettings):
-        return
-    if odometry != RecordedOdometrySettings():
-        raise ConfigError(
-            "keys of `odometry` other than kind mean nothing to the rendered lab; set the "
-            "noise of its wheels under dataset.odometry"
-        )

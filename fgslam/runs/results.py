@@ -126,6 +126,22 @@ def numbers_table(
     return TextTable(key, heading, "quantity", (Column("value", "of the run"),), rows)
 
 
+def metrics_table(
+    key: str,
+    heading: str,
+    first: str,
+    columns: Sequence[tuple[str, str, str, str]],
+    rows: Mapping[str, Mapping[str, Any]],
+) -> TextTable:
+    """A row of numbers for each name; of a column heading, key of the number, format, meaning."""
+    cells = tuple(
+        (name, tuple(number_text(numbers.get(of), spec) for _, of, spec, _ in columns))
+        for name, numbers in rows.items()
+    )
+    shown = tuple(Column(heading, meaning) for heading, _, _, meaning in columns)
+    return TextTable(key, heading, first, shown, cells)
+
+
 def number_text(value: JsonValue, spec: str = ".2f") -> str:
     """A number as text, decimal ones by ``spec``; a dash where it is not known."""
     if value is None or (isinstance(value, float) and not np.isfinite(value)):

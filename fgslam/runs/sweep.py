@@ -441,9 +441,8 @@ def perform_trial(config: ExperimentConfig, estimators: Sequence[EstimatorSettin
         values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
         numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}
         for name, errors in judged.nees.items():
-            if name in _POOLED.values():
-                numbers[f"nees_{name}_dof"] = int(errors.dof.sum())
-                numbers[f"nees_{name}_items"] = int((errors.dof > 0).sum())
+            numbers[f"nees_{name}_dof"] = int(errors.dof.sum())
+            numbers[f"nees_{name}_items"] = int((errors.dof > 0).sum())
         times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
         rows.append(Row(settings.title, numbers, times))
     return rows

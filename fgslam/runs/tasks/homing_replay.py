@@ -37,12 +37,12 @@ from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.frontend.settings import HomingVectorSettings
-from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
+from fgslam.report.content import Cell, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure, local_map_figure, sorted_errors
 from fgslam.runs.config import HomingExperiment, HomingTrialsConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.folder import COMPARISON_FILE, TIMING_FILE, TRIALS_FILE, digest_of
-from fgslam.runs.results import finish, number_text
+from fgslam.runs.results import finish, metrics_table
 
 LOG_FOLDER = "logs"
 ESTIMATES_FILE = "estimates.csv"
@@ -138,11 +138,11 @@ _COLUMNS = (
      "error of the distance left, 1 being the leg"),
     ("diverged", "diverged", "", "trials whose home direction is off by more than 30 degrees, or "
      "failed"),
-    ("NEES robot", "nees_robot", "nees", "normalised error squared of the pose per degree of "
+    ("NEES robot", "nees_robot", "", "normalised error squared of the pose per degree of "
      "freedom: 1 is right; ok, high (overconfident) or low (conservative) by the 95 % chi-square "
      "band, which is in metrics.json"),
-    ("NEES target", "nees_target", "nees", "the same of the target"),
-    ("NEES home", "nees_home", "nees", "the same of the home vector"),
+    ("NEES target", "nees_target", "", "the same of the target"),
+    ("NEES home", "nees_home", "", "the same of the home vector"),
     ("update ms", "update_ms", ".2f",
      "median time of an update, with the estimate that a robot drives by"),
 )  # fmt: skip
@@ -181,22 +181,17 @@ def _estimator_table(
     key: str, heading: str, homings: Mapping[str, Sequence[JudgedHoming]]
 ) -> TextTable:
     """A row for each estimator, given what it made of each homing."""
-    rows = []
+    rows = {}
     for title, judged in homings.items():
-        numbers = _summary_numbers(judged)
+        numbers = rows[title] = _summary_numbers(judged)
         failed = sum(bool(one.failure) for one in judged)
         numbers["diverged"] = numbers.get("diverged", 0) + failed
         numbers["update_ms"] = _update_times(judged)["median"]
-        cells = tuple(_cell(numbers.get(name), spec) for _, name, spec, _ in _COLUMNS)
-        rows.append((title, cells))
-    columns = tuple(Column(name, meaning) for name, _, _, meaning in _COLUMNS)
-    return TextTable(key, heading, "estimator", columns, tuple(rows))
-
-
-def _cell(value: Any, spec: str) -> str:
-    if value is None or spec != "nees":
-        return number_text(value, spec)
-    return f"{value['per_dof']:.3g} {_IN_A_WORD[value['verdict']]}"
+        for name in NEES_NAMES:
+            if (nees := numbers.get(f"nees_{name}")) is not None:
+                verdict = _IN_A_WORD[nees["verdict"]]
+                numbers[f"nees_{name}"] = f"{nees['per_dof']:.3g} {verdict}"
+    return metrics_table(key, heading, "estimator", _COLUMNS, rows)
 
 
 # ------------------------------------------------------------------------------------------

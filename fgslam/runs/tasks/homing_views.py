@@ -41,7 +41,7 @@ from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings, 
 from fgslam.homing.links import UNORDERED, Answer, Link, Pair, VisualWords, Walks, sift_inliers
 from fgslam.homing.places import Localiser, transition_along
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
-from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
+from fgslam.report.content import Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (
     Links,
     claimed_against_true,
@@ -55,7 +55,7 @@ from fgslam.runs.results import (
     draw_picture,
     finish,
     median,
-    number_text,
+    metrics_table,
     numbers_table,
     write_table,
 )
@@ -630,14 +630,14 @@ def error_numbers(errors: pd.DataFrame) -> dict[str, Any]:
 
 
 _ERROR_COLUMNS = (
-    ("answered", "answered", "pairs with a homing vector", "d"),
-    ("direction deg median", "direction_median_deg", "absolute error of the direction", ".2f"),
-    ("p95", "direction_p95_deg", "95 % of the answers are better", ".2f"),
-    ("rotation deg median", "rotation_median_deg", "absolute error of the rotation", ".2f"),
-    ("p95 ", "rotation_p95_deg", "95 % of the answers are better", ".2f"),
-    ("worse than 10 deg", "worse_than_10_deg", "answers whose direction or rotation is", "d"),
-    ("covered joint 95 %", "covered_joint_95", "errors within the stated joint 95 % region", ".1%"),
-    ("NEES", "nees_per_dof", "normalised error squared per degree of freedom: 1 is right", ".2f"),
+    ("answered", "answered", "d", "pairs with a homing vector"),
+    ("direction deg median", "direction_median_deg", ".2f", "absolute error of the direction"),
+    ("p95", "direction_p95_deg", ".2f", "95 % of the answers are better"),
+    ("rotation deg median", "rotation_median_deg", ".2f", "absolute error of the rotation"),
+    ("p95 ", "rotation_p95_deg", ".2f", "95 % of the answers are better"),
+    ("worse than 10 deg", "worse_than_10_deg", "d", "answers whose direction or rotation is"),
+    ("covered joint 95 %", "covered_joint_95", ".1%", "errors within the stated joint 95 % region"),
+    ("NEES", "nees_per_dof", ".2f", "normalised error squared per degree of freedom: 1 is right"),
 )
 
 
@@ -645,19 +645,10 @@ def error_tables(numbers: Mapping[str, Any] | None) -> tuple[TextTable, ...]:
     """:func:`error_numbers` of all pairs, and of those within one room and not; none without."""
     if numbers is None:
         return ()
-    groups = {"all pairs": numbers}
-    for name in ("same_room", "different_rooms"):
-        if name in numbers:
-            groups[name.replace("_", " ")] = numbers[name]
-    rows = tuple(
-        (
-            name,
-            tuple(number_text(group.get(key), spec) for _, key, _, spec in _ERROR_COLUMNS),
-        )
-        for name, group in groups.items()
-    )
-    columns = tuple(Column(name, meaning) for name, _, meaning, _ in _ERROR_COLUMNS)
-    return (TextTable("errors", "Errors of the answered pairs", "pairs", columns, rows),)
+    parts = [name for name in ("same_room", "different_rooms") if name in numbers]
+    groups = {"all pairs": numbers} | {name.replace("_", " "): numbers[name] for name in parts}
+    heading = "Errors of the answered pairs"
+    return (metrics_table("errors", heading, "pairs", _ERROR_COLUMNS, groups),)
 
 
 def write_pairs(path: Path, answers: Sequence[PairAnswer], names: Sequence[str]) -> None:
