@@ -538,20 +538,18 @@ def lone_answer(estimate: Estimate) -> Answer:
 
 @dataclass(frozen=True, slots=True)
 class MeanInterval:
-    """Mean of independent trials and its confidence interval by Student's t.
+    """Mean of independent trials and its 95 % confidence interval by Student's t.
 
     Attributes:
         mean: of the values.
         lower, upper: of the interval; None for fewer than two values.
         count: how many values.
-        probability: of the interval.
     """
 
     mean: float
     lower: float | None
     upper: float | None
     count: int
-    probability: float
 
 
 SIGNIFICANT = 0.05
@@ -575,7 +573,7 @@ class PairedTest:
     ratio: float | None
 
 
-def mean_interval(values: FloatArray, probability: float = 0.95) -> MeanInterval | None:
+def mean_interval(values: FloatArray) -> MeanInterval | None:
     """Mean and interval of finite values (n,); None where there is none."""
     known = values[np.isfinite(values)]
     n = len(known)
@@ -583,10 +581,10 @@ def mean_interval(values: FloatArray, probability: float = 0.95) -> MeanInterval
         return None
     mean = float(known.mean())
     if n == 1:
-        return MeanInterval(mean, None, None, 1, probability)
+        return MeanInterval(mean, None, None, 1)
     error = float(known.std(ddof=1)) / np.sqrt(n)
-    half = float(student_quantile(0.5 + 0.5 * probability, n - 1)) * error
-    return MeanInterval(mean, mean - half, mean + half, n, probability)
+    half = float(student_quantile(0.975, n - 1)) * error
+    return MeanInterval(mean, mean - half, mean + half, n)
 
 
 def paired_test(a: FloatArray, b: FloatArray) -> PairedTest | None:

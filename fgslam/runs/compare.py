@@ -229,8 +229,15 @@ def compare_runs(
         else:
             task = open_homing_comparison(config, run, estimators)
         opened.append((with_estimators(config, estimators), task))
+    # No results replace earlier ones unasked, or the run that they are made from.
     for run, folder in zip(runs, folders, strict=True):
-        require_room(folder, run, existing)
+        if folder.resolve() in (run.resolve(), *run.resolve().parents):
+            raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
+        if existing == "refuse" and is_run_folder(folder):
+            raise OutputError(
+                f"{folder} holds results already; choose another --out, or add --overwrite or "
+                "--resume"
+            )
     several_resumed = existing == "resume" and len(runs) > 1
     for (now, task), folder in zip(opened, folders, strict=True):
         if several_resumed and is_run_folder(folder):  # no table shall mix estimators or logs
@@ -238,16 +245,14 @@ def compare_runs(
             require_same_ground(task.provenance, folder)
     results = []
     for (now, task), folder in zip(opened, folders, strict=True):
-        begun = existing
-        if several_resumed:
-            begun = "resume" if is_run_folder(folder) else "refuse"
-        if several_resumed and begun == "resume" and is_finished(folder):
+        if several_resumed and is_run_folder(folder) and is_finished(folder):
             result = RunResult(now, folder, "finished", (f"{folder}: had finished",))
             found = result.metrics["estimators"].values()
             failed = all(one.get("failure") for one in found)
             results.append(dataclasses.replace(result, failed=failed))
         else:
             opener = partial(lambda opened, *_: opened, task)  # it is open already
+            begun = "refuse" if several_resumed and not is_run_folder(folder) else existing
             results.append(run_task(opener, now, folder, begun, progress, stopped, jobs))
     if out is not None and len(runs) > 1 and slam[0]:
         names = _distinct([one.config.name for one in results], results)
@@ -297,16 +302,6 @@ def _load_run(run: Path) -> ExperimentConfig | HomingExperiment:
     if isinstance(config, HomingExperiment):
         return config
     return as_task(ExperimentConfig, config, str(path))
-
-
-def require_room(folder: Path, run: Path, existing: ExistingFolder) -> None:
-    """Raises where results would replace earlier ones unasked, or the run they are made from."""
-    if folder.resolve() in (run.resolve(), *run.resolve().parents):
-        raise ConfigError(f"--out {folder}: holds the run itself; choose another folder")
-    if existing == "refuse" and is_run_folder(folder):
-        raise OutputError(
-            f"{folder} holds results already; choose another --out, or add --overwrite or --resume"
-        )
 
 
 def _folders(runs: Sequence[Path], out: Path | None) -> list[Path]:

@@ -129,7 +129,15 @@ def export_run(
     if wanted.graph or wanted.colour or wanted.images:
         trajectory = trajectory.of("right", rig())
     if wanted.graph is not None:
-        lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
+        # Observations become points with their first-order covariance.
+        graph = build_graph(log(), trajectory, points.ids, points.positions)
+        write_g2o(wanted.graph, graph, [*([remark] if remark else []), *_HEADER])
+        left_out = sum(len(increment.observations) for increment in log()) - len(graph.points)
+        lines.append(
+            f"{wanted.graph}: {len(graph.poses)} poses, {len(graph.landmarks)} landmarks, "
+            f"{len(graph.motions)} odometry edges, {len(graph.points)} observations "
+            f"({left_out} rejected ones left out)"
+        )
     points = points.select(points.valid) if wanted.valid_only else points
     if wanted.colour or wanted.images:
         config = config_of(run, wanted.recording)
@@ -331,36 +339,6 @@ _HEADER = (
     "odometry to relocalised frames",
     "vertices: the estimator's final answer, first pose held",
 )
-
-
-def export_graph(
-    path: Path, log: MeasurementLog, trajectory: Trajectory, points: MapPoints, remark: str = ""
-) -> str:
-    """Writes a log's measurements around an estimator's final answer, as .g2o.
-
-    Observations become points with their first-order covariance.
-
-    Args:
-        path: the file.
-        log: the run's measurements.
-        trajectory: an estimator's final poses.
-        points: its landmarks.
-        remark: put into a comment.
-
-    Returns:
-        A line about what was written.
-
-    Raises:
-        OutputError: another ending, or it cannot be written.
-    """
-    graph = build_graph(log, trajectory, points.ids, points.positions)
-    write_g2o(path, graph, [*([remark] if remark else []), *_HEADER])
-    left_out = sum(len(increment.observations) for increment in log) - len(graph.points)
-    return (
-        f"{path}: {len(graph.poses)} poses, {len(graph.landmarks)} landmarks, "
-        f"{len(graph.motions)} odometry edges, {len(graph.points)} observations "
-        f"({left_out} rejected ones left out)"
-    )
 
 
 def build_graph(

@@ -142,7 +142,9 @@ def judge(
             f"--covariance is of one estimate, and {len(named)} are given; judge them one by one, "
             "or put each one's covariances into its rows"
         )
-    words, true = _tangent_words(tangent), None
+    words, true = frozenset(filter(None, map(str.strip, tangent.split(",")))), None
+    for word in sorted(words - frozenset(TANGENT_WORDS)):
+        raise ConfigError(f"--tangent: no word {word!r}; use {', '.join(TANGENT_WORDS)}")
     if truth is not None:
         true = StatedPoses(truth) if isinstance(truth, Trajectory) else read_stated(truth)
     notes: list[str] = list(true.notes) if true else []
@@ -208,14 +210,6 @@ def _named(given: Any) -> dict[str, Given]:
     short = [path.parent.name if path.name == _FINAL else path.stem for path in paths]
     names = short if len(set(short)) == len(short) else map(str, paths)
     return dict(zip(names, map(str, paths), strict=True))
-
-
-def _tangent_words(text: str) -> frozenset[str]:
-    words = [word for part in text.split(",") if (word := part.strip())]
-    for word in words:
-        if word not in TANGENT_WORDS:
-            raise ConfigError(f"--tangent: no word {word!r}; use {', '.join(TANGENT_WORDS)}")
-    return frozenset(words)
 
 
 def _opened(one: Given, covariance: Path | None) -> tuple[StatedPoses, tuple[Path, str] | None]:

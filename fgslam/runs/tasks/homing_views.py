@@ -198,7 +198,32 @@ def _run_map(config: TopologicalMapConfig, views: OmniRecording, context: Contex
     kilobytes = topology.save(folder / "map.npz")
     routes = [_route(topology, asked) for asked in config.routes]
     located = _localise(config, features, found, names, context)
-    numbers = _map_numbers(topology, views, len(found), kilobytes, routes, located)
+    parts, links = topology.components(), link_table(topology, views.poses)
+    numbers: dict[str, JsonValue] = {
+        "nodes": len(topology),
+        "homings_tried": len(found),
+        "links": len(links),
+        "components": len(parts),
+        "largest_component": len(parts[0]) if parts else 0,
+        "outside_largest": [topology.names[k] for part in parts[1:] for k in part.tolist()],
+        "longest_link_places": max(links["places_apart"], default=None),
+        "longest_link_m": max(links["distance_m"].dropna(), default=None),
+        "least_support": min(links["inliers"], default=None),
+        "pairs_not_linked": len(topology.rejected),
+        "kilobytes_per_view": kilobytes,
+        "routes": [
+            {"asked": list(r.asked), "found": list(r.found), "reason": r.reason or None}
+            for r in routes
+        ],
+        "routes_found": sum(not r.reason for r in routes),
+        "localisation": None
+        if located is None
+        else {
+            "held_out": len(located),
+            "at_a_neighbour": sum(one.neighbour for one in located),
+            "last_probability": located[-1].probability if located else None,
+        },
+    }
     write_links(folder, topology, views.poses)
     rows = [["-".join(r.asked), "-".join(r.found), r.reason] for r in routes]
     write_csv(folder / "routes.csv", Route._fields, rows)
@@ -349,43 +374,6 @@ _MAP_ROWS = {
     "fewest inliers of a link": "least_support",
     "pairs tried and not linked": "pairs_not_linked",
 }
-
-
-def _map_numbers(
-    topology: TopologicalMap,
-    views: OmniRecording,
-    tried: int,
-    kilobytes: float,
-    routes: Sequence[Route],
-    located: list[Localised] | None,
-) -> dict[str, JsonValue]:
-    parts, links = topology.components(), link_table(topology, views.poses)
-    lengths = links["distance_m"].dropna()
-    return {
-        "nodes": len(topology),
-        "homings_tried": tried,
-        "links": len(links),
-        "components": len(parts),
-        "largest_component": len(parts[0]) if parts else 0,
-        "outside_largest": [topology.names[k] for part in parts[1:] for k in part.tolist()],
-        "longest_link_places": max(links["places_apart"], default=None),
-        "longest_link_m": max(lengths, default=None),
-        "least_support": min(links["inliers"], default=None),
-        "pairs_not_linked": len(topology.rejected),
-        "kilobytes_per_view": kilobytes,
-        "routes": [
-            {"asked": list(r.asked), "found": list(r.found), "reason": r.reason or None}
-            for r in routes
-        ],
-        "routes_found": sum(not r.reason for r in routes),
-        "localisation": None
-        if located is None
-        else {
-            "held_out": len(located),
-            "at_a_neighbour": sum(one.neighbour for one in located),
-            "last_probability": located[-1].probability if located else None,
-        },
-    }
 
 
 def link_table(topology: TopologicalMap, poses: FloatArray | None = None) -> pd.DataFrame:

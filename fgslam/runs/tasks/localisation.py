@@ -37,7 +37,7 @@ from fgslam.evaluation.localisation import (
 )
 from fgslam.evaluation.statistics import JsonValue, spread
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.report.content import UNKNOWN, Column, Figure, TextTable, write_csv
+from fgslam.report.content import UNKNOWN, Column, TextTable, write_csv
 from fgslam.report.homing_figures import located_figure
 from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import (
@@ -567,7 +567,13 @@ def write_results(
     }
     write_document(result, numbers)
     bounds = bounds_of(result.config)
-    figures = [_figure(given, one, bounds) for one in judged]
+    landmarks, drive = given.saved.landmarks.positions, given.saved.trajectory.poses
+    figures = []
+    for one in judged:
+        errors = one.errors
+        false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
+        words = f"localisation-{one.frames}", f"Found from {in_frames(one.frames)}"
+        figures.append(located_figure(words, landmarks, drive, one.answers, np.asarray(false)))
     if result.config.output.pictures:
         from fgslam.report.pictures import draw_figure  # Matplotlib takes a second
 
@@ -605,14 +611,6 @@ def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
             errors.dof[k],
             found.why,
         )
-
-
-def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
-    answers, errors = judged.answers, judged.errors
-    false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
-    words = f"localisation-{judged.frames}", f"Found from {in_frames(judged.frames)}"
-    landmarks, path = given.saved.landmarks.positions, given.saved.trajectory.poses
-    return located_figure(words, landmarks, path, answers, np.asarray(false))
 
 
 # ------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from fgslam.core.sensors import CameraRig, moved_pixels
 from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures
 from fgslam.datasets.ledger import Entry, as_values, rests_on_guess
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
-from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
+from fgslam.evaluation.judging import closure_counts, predicted_poses
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, align, associate
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
@@ -552,11 +552,18 @@ class RunOutputs:
         """Log, trajectories, covariances, map, metrics and timing of the frames so far."""
         estimate = self.pipeline.estimate()
         self.recorder.log.save(self.folder / LOG_FILE)
-        truth = self._write_truth(with_landmarks=status == "finished")
+        known, frame, rig = self.sequence.ground_truth, self.sequence.truth_frame, self.sequence.rig
+        if known is not None:
+            known.of(frame, rig).save(self.folder / GROUND_TRUTH_FILE)
+        if status == "finished":
+            landmarks = rendered_landmark_truth(self.sequence, self.recorder.log)
+            if landmarks is not None:
+                write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *landmarks)
+        # Read back: replays of the log are judged by the same digits.
+        truth = load_truth(self.folder, self.recorder.log)
         online_path = self.recorder.online
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         own = make_subfolder(self.folder, self.title)
-        frame, rig = self.sequence.truth_frame, self.sequence.rig
         paths = online_path.of(frame, rig), estimate.of(frame, rig)
         write_estimate(own, *paths, points, self.remark)
         write_frames(own / FRAMES_FILE, online_path.timestamps, frame_rows(self.recorder))
@@ -604,21 +611,6 @@ class RunOutputs:
         if self.pipeline.calibration is not None:
             about["rig"] = calibration_numbers(self.pipeline.calibration)
         write_metrics(self.folder / METRICS_FILE, len(self.recorder), estimators, about)
-
-    def _write_truth(self, with_landmarks: bool) -> Truth:
-        """True path, and true landmarks where the recording is rendered and ``with_landmarks``.
-
-        What is returned is read back: replays of the log are judged by the same digits.
-        """
-        truth, frame = self.sequence.ground_truth, self.sequence.truth_frame
-        if truth is not None:
-            truth.of(frame, self.sequence.rig).save(self.folder / GROUND_TRUTH_FILE)
-        found = (
-            rendered_landmark_truth(self.sequence, self.recorder.log) if with_landmarks else None
-        )
-        if found is not None:
-            write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
-        return load_truth(self.folder, self.recorder.log)
 
     @property
     def ledger(self) -> tuple[Entry, ...]:
