@@ -165,7 +165,6 @@ def chosen_view(
         for camera, rotation in zip(cameras, rotations, strict=True):
             inner = _inner(camera, rotation)
             low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
-    if fov_deg is None:
         natural = _LEAST_RESOLUTION * float(np.mean([camera.focal_px for camera in cameras]))
         # Where no rectangle is seen by all, borders are black.
         focal = max(*(np.array(size) / (high - low)), natural) if (high > low).all() else natural
