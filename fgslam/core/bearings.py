@@ -6,7 +6,7 @@ A file of :mod:`fgslam.core.store`, like the measurement log.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal
@@ -257,10 +257,6 @@ class TrackedBearings(Rows):
     sigma_bearing: FloatArray
     elevation: FloatArray
     sigma_elevation: FloatArray
-
-    def renumbered(self, ids: IntArray) -> TrackedBearings:
-        """The same bearings under other identities (m,), ascending too."""
-        return replace(self, ids=ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -126,16 +126,6 @@ class SeenTurns:
             difference = difference - bias * dt
         return np.asarray(np.linalg.norm(difference, axis=1))
 
-    def best_shift(self) -> float:
-        """Seconds to be added to the odometry's stamps, on a coarse grid, then on a fine one."""
-        best = 0.0
-        for reach, step in ((_RANGE_S, _COARSE_S), (_COARSE_S, _FINE_S)):
-            count = round(reach / step)
-            shifts = best + step * np.arange(-count, count + 1)
-            nearest = shifts[np.argsort(np.abs(shifts), kind="stable")]  # of equals the least
-            best = float(nearest[int(np.argmin([_median(self.errors(s)) for s in nearest]))])
-        return best
-
 
 def _median(errors: FloatArray) -> float:
     """Infinite where too few are known."""
@@ -146,7 +136,12 @@ def _median(errors: FloatArray) -> float:
 def judged(seen: SeenTurns) -> Judged:
     """The same of turns that were seen already; raises as :func:`judged_turns`."""
     size = float(np.median(np.linalg.norm(seen.turns, axis=1)))
-    best = seen.best_shift()
+    best = 0.0  # seconds to be added to the stamps, on a coarse grid, then on a fine one
+    for reach, step in ((_RANGE_S, _COARSE_S), (_COARSE_S, _FINE_S)):
+        count = round(reach / step)
+        shifts = best + step * np.arange(-count, count + 1)
+        nearest = shifts[np.argsort(np.abs(shifts), kind="stable")]  # of equals the least
+        best = float(nearest[int(np.argmin([_median(seen.errors(s)) for s in nearest]))])
     now, then = seen.errors(0.0), seen.errors(best)
     before, left = _median(now), _median(then)
     if size > _LEAST_TURN_RAD:

@@ -7,7 +7,7 @@ it), tracks that jump to another point and stay with it, and single bearings tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class SimulatedHoming:
         tracks = []
         for image in self.tracks:
             kept = image.select(number[image.ids] >= 0)
-            tracks.append(kept.renumbered(number[kept.ids]))
+            tracks.append(replace(kept, ids=number[kept.ids]))
         truth = HomingTruth(self.truth.target, self.truth.robots, self.truth.landmarks[rows])
         return tuple(tracks), truth
 

@@ -84,7 +84,7 @@ def test_unknown_identities_are_refused(case: Trial, settings: HomingEstimatorSe
     before = contents(estimator.estimate())
     image = case.tracks[2]
     with pytest.raises(EstimatorError, match="is not in the local map"):
-        estimator.update(image.renumbered(image.ids + 1000))
+        estimator.update(replace(image, ids=image.ids + 1000))
     with pytest.raises(EstimatorError, match="no finite bearing"):
         estimator.update(replace(image, bearing=np.full(len(image), np.nan)))
     assert contents(estimator.estimate()) == before
