@@ -7,7 +7,7 @@ by iSAM2 and at once; stereo tracks are replayed.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -225,7 +225,7 @@ def run_classics(
     with Pool(jobs) if jobs > 1 else nullcontext(Executor()) as pool:
         for name in left[:jobs]:  # they begin in their order
             progress(name, 0, 1)
-        for k, found in pool.run(partial(_rows, steps, kinds), names, stopped):
+        for k, found in pool.run(partial(run_classic, steps=steps, kinds=kinds), names, stopped):
             if found == Failed(NOT_BEGUN):
                 break
             name = Path(names[k]).name
@@ -239,14 +239,10 @@ def run_classics(
     return list(chain(*rows))
 
 
-def _rows(steps: int | None, kinds: Collection[str], name: str) -> list[ClassicRow]:
-    return list(run_classic(name, steps, kinds))
-
-
 def run_classic(
     name: str, steps: int | None = None, kinds: Collection[str] = GRAPH_KINDS
-) -> Iterator[ClassicRow]:
-    """Every estimator that fits, one after the other.
+) -> list[ClassicRow]:
+    """Every estimator that fits.
 
     Args:
         name: of :data:`CLASSICS`, or the path of a graph: `.g2o`, `.graph`, or of a robot of UTIAS
@@ -260,28 +256,29 @@ def run_classic(
     if name == "kitti00":
         opened = open_stereo_tracks(StereoTracksSettings(stop=steps), ConstantVelocitySettings())
         count = sum(len(one.observations) for one in opened.log)
-        yield from _replayed(name, opened.log, opened.ground_truth, count, _TRACKED)
-        return
+        return _replayed(name, opened.log, opened.ground_truth, count, _TRACKED)
     if name in _HEADING or name.endswith(_MRCLAM):
         log, where = _ranges(name) if name in _HEADING else _barcodes(Path(name))
         log = MeasurementLog(increments=log.increments[:steps])
         count = sum(len(one.measured[0]) for one in log)
-        yield from _replayed(Path(name).name, log, where, count, _BY_RANGE)
-        return
+        return _replayed(Path(name).name, log, where, count, _BY_RANGE)
     file, make_truth = _GRAPHS.get(name, (name, None))
     graph = read_graph(_data(file) if name in _GRAPHS else Path(file)).first(steps)
     poses = None if make_truth is None else make_truth()
     truth = None if poses is None else Trajectory(np.arange(len(poses), dtype=np.float64), poses)
-    found = solve_by_steps(graph)
-    if "isam2" in kinds:
-        yield _row(Path(name).name, "isam2", graph.size, found, truth)
+    solved = {"isam2": solve_by_steps(graph)}
     if "batch" in kinds:
-        batch = solve_at_once(graph, found.values)
-        yield _row(Path(name).name, "batch", graph.size, batch, truth)
+        solved["batch"] = solve_at_once(graph, solved["isam2"].values)
+    rows = [
+        _row(Path(name).name, kind, graph.size, found, truth)
+        for kind, found in solved.items()
+        if kind in kinds
+    ]
     if name == "victoria_park":
-        best = batch.estimate.trajectory
-        for row in _replayed(name, log_of(graph), best, graph.size, _ON_LANDMARKS):
-            yield replace(row, nees=None)
+        best = solved["batch"].estimate.trajectory
+        others = _replayed(name, log_of(graph), best, graph.size, _ON_LANDMARKS)
+        rows += [replace(row, nees=None) for row in others]
+    return rows
 
 
 def _row(
@@ -297,13 +294,16 @@ def _row(
 
 def _replayed(
     name: str, log: MeasurementLog, truth: Trajectory | None, count: int, kinds: Sequence[str]
-) -> Iterator[ClassicRow]:
+) -> list[ClassicRow]:
+    rows = []
     for kind in kinds:
         found = replay(log, all_kinds()[kind], EgoMotionSettings())
         metrics = judge_replay(found, Truth(truth)).metrics
         times = found.column("update_ms") + found.column("solve_ms")
-        yield ClassicRow(name, kind, len(log), count, metrics.ate_rmse_m, metrics.nees_pose_per_dof,
-                         None, float(times.mean()), float(times.max()), found.failure)  # fmt: skip
+        known = metrics.ate_rmse_m, metrics.nees_pose_per_dof, None
+        ms = float(times.mean()), float(times.max())
+        rows.append(ClassicRow(name, kind, len(log), count, *known, *ms, found.failure))
+    return rows
 
 
 def classics_table(rows: Sequence[ClassicRow]) -> TextTable:

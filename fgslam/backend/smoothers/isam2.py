@@ -138,15 +138,12 @@ class Isam2Solver(WholeGraphSolver):
             covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
         except RuntimeError as error:
             self._repair(self.values, error)
-            covariance = self._marginal_again(frame)
+            try:
+                covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
+            except RuntimeError as again:
+                raise self._failed(again) from None
         pose = poses_of_frame(self.values, frame)
         return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
-
-    def _marginal_again(self, frame: int) -> FloatArray:
-        try:
-            return np.asarray(self.tree.marginalCovariance(pose_key(frame)))
-        except RuntimeError as error:
-            raise self._failed(error) from None
 
     def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Updates the tree with the loop, or rebuilds it where the loop moves the map."""

@@ -166,8 +166,7 @@ class FixedLagSolver:
         inside = [track.variable for _, track in self.builder.admission.in_graph()]
         places = landmarks.points[np.searchsorted(landmarks.variables, inside)]
         found = solved.eliminated.landmarks()[solved.rows(inside)]
-        found_each = self._nuisances()
-        nuisances = (nuisance_words(kind, x, np.diagonal(known)) for kind, x, known in found_each)
+        nuisances = (nuisance_words(k, x, np.diagonal(known)) for k, x, known in self._nuisances())
         return Solution(
             np.array(self.poses),
             covariances,
@@ -586,7 +585,10 @@ class SlidingWindowSolver(WholeGraphSolver):
             return False
         self.accept(loop)
         if inside:
-            return self._closed_inside(loop)
+            self.window.factors.add(constraint_factor(loop))
+            self._leaving = solved = self._solve()
+            there = self._measured(solved, len(solved.frames) - 1)
+            return Smoothed(self.window.values(), there, self.window.frames[0])
         self.move_by_loop(found, loop, chain)
         every = range(len(self.held))
         values = WindowValues(
@@ -594,12 +596,6 @@ class SlidingWindowSolver(WholeGraphSolver):
             dict(zip(map(landmark_key, every), self.held.points, strict=True)),
         )
         return Smoothed(values, found, by_loop=True)
-
-    def _closed_inside(self, loop: Constraint) -> Smoothed:
-        self.window.factors.add(constraint_factor(loop))
-        self._leaving = solved = self._solve()
-        last = self._measured(solved, len(solved.frames) - 1)
-        return Smoothed(self.window.values(), last, self.window.frames[0])
 
     def _at(self, frame: int) -> Prediction:
         """A pose as it is now, as uncertain as when it left."""

@@ -879,7 +879,10 @@ class Window:
         self._into_prior(gone, touched, leaving)
         self.factors = untouched
         self._keep(lambda one: one.poses >= first)
-        self._drop_poses(leaving)
+        for frame in self.frames[:leaving]:
+            self._anchors.pop(frame, None)
+        self.frames = self.frames[leaving:]
+        self.poses, self._shift = self.poses[leaving:], self._shift[leaving:]
         left = [*(one.points for one in self._every), np.array([*staying], np.int64)]
         return self._eliminate(~np.isin(self.landmarks.variables, np.concatenate(left)))
 
@@ -917,12 +920,6 @@ class Window:
         residual -= products(rows.by_pose, self._shift[pose])
         pulls[:, :, 0] = residual
         return Look(pose, point, rows, pulls, shifted, look.nuisance)
-
-    def _drop_poses(self, leaving: int) -> None:
-        for frame in self.frames[:leaving]:
-            self._anchors.pop(frame, None)
-        self.frames = self.frames[leaving:]
-        self.poses, self._shift = self.poses[leaving:], self._shift[leaving:]
 
     def _eliminate(self, gone: BoolArray) -> Landmarks:
         """Takes landmarks (by a mask of all) out of the window; what they measured stays."""
