@@ -81,7 +81,7 @@ class PerLandmarkSettings(NamedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class LandmarkKalmanSettings(PerLandmarkSettings):
-    """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
+    """Se, Lowe and Little (2001): least-squares pose, one 3x3 filter a landmark."""
 
     kind: Literal["landmark_kalman"] = "landmark_kalman"
 

@@ -204,11 +204,11 @@ def slam_page(data: ReportData) -> Page:
 
 
 def headline(data: ReportData) -> tuple[str, ...]:
-    """Sentences about success, accuracy, consistency and failures, most important first."""
+    """Sentences about success, accuracy, consistency, cost and failures, most important first."""
     working = [e for e in data.estimators if not e.failure]
     lines = [*data.alarms]
     lines += [_accuracy(data, working)] if working else ["No estimator gave a result."]
-    lines += _consistency(working)
+    lines += [*_consistency(working), *_cost(working)]
     # By how much, differs from one to the next: each has its own among the remarks.
     lines += [f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark][:1]
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
@@ -229,7 +229,8 @@ def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
     second, other = ranked[1]
     if second <= _ABOUT_EQUAL * first:
         equal = [name for error, name in ranked if error <= _ABOUT_EQUAL * first]
-        return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how})."
+        rest = "".join(f"; {name} {metres(error)}" for error, name in ranked[len(equal) :])
+        return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how}){rest}."
     ratio = f", {second / first:.2g} times as much" if first > 0.0 else ""
     return (
         f"{title} is the most accurate: off by {metres(first)} ({how}). "
@@ -248,6 +249,14 @@ def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
     unknown = [e.title for e in working if e.verdict not in _JUDGED]
     if unknown:
         yield f"Whether the covariances of {_listed(unknown)} can be believed is not known."
+
+
+def _cost(working: list[EstimatorReport]) -> Iterator[str]:
+    timed = [e for e in working if np.isfinite(e.update_ms).any()]
+    medians = sorted((float(np.nanmedian(e.update_ms)), e.title) for e in timed)
+    if len(medians) > 1:
+        times = _listed([f"{title} {median:.2g} ms" for median, title in medians])
+        yield f"The estimator's work for a frame took, in the median: {times}."
 
 
 def _nees(value: float | None) -> str:

@@ -200,10 +200,6 @@ def _require_outputs(run: Path, wanted: Wanted) -> None:
             "leave --axes out, or give a .tum"
         )
     inputs = (*sources_of(run), *([wanted.recording] if wanted.recording else []))
-    for path in wanted.files:
-        require_output(path, wanted.overwrite, inputs)
-    if wanted.images is not None:
-        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
     if wanted.graph is not None and not run.is_file():
         require_suffix(wanted.graph, *GRAPH)
     if wanted.dense is not None:
@@ -215,6 +211,10 @@ def _require_outputs(run: Path, wanted: Wanted) -> None:
             f"cannot write {wanted.grid}: a grid is a .yaml with a .pgm next to it; give "
             "a name.yaml"
         )
+    for path in wanted.files:
+        require_output(path, wanted.overwrite, inputs)
+    if wanted.images is not None:
+        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
 
 
 def save_dense(found: DenseMap, wanted: Wanted, remark: str) -> list[str]:

@@ -303,6 +303,6 @@ def next_commands(folder: Path | str) -> tuple[str, ...]:
     run = shlex.quote(str(folder))
     return (
         f"fgslam compare {run} --estimators landmark_kalman,isam2,batch",
-        f"fgslam export {run} --map map.ply --colour",
+        f"fgslam export {run} --map map.ply --colour --dense cloud.ply --grid map.yaml",
         f"fgslam film {run} run.mp4",
     )

@@ -122,7 +122,9 @@ def test_truth_that_is_left_out_is_stated_once() -> None:
 def test_errors_within_the_tolerance_count_as_ties() -> None:
     lines = sentences(("a", 0.0100, 1.0, None), ("b", 0.0102, 1.0, None), ("c", 0.02, 1.0, None))
     assert lines[0].startswith("a and b are about equally accurate: 1.00 cm")
-    assert lines[-1] == "Whether the covariances of a, b and c can be believed is not known."
+    assert lines[0].endswith("; c 2.00 cm.")
+    assert lines[-1].startswith("The estimator's work for a frame took, in the median: ")
+    assert lines[-2] == "Whether the covariances of a, b and c can be believed is not known."
 
 
 def test_a_perfect_path_divides_by_nothing() -> None:
