@@ -68,7 +68,7 @@ def test_demo_is_the_loop_of_the_paper(monkeypatch: Patch, tmp_path: Path) -> No
 
     def noted(config: Experiment, folder: Path, existing: str, *rest: object) -> RunResult:
         ran.append((config.name, folder, existing))
-        return RunResult(config, folder, "finished", written=False)
+        return RunResult(config, folder, "finished")
 
     monkeypatch.setattr("fgslam.runs.run.run_experiment", noted)
     assert main(monkeypatch, "demo", "--out", tmp_path / "demo") == 0
@@ -395,6 +395,7 @@ def test_mistakes_of_dense_export(
     inside.unlink()
     (tmp_path / "map.pgm").write_text("")
     assert "map.pgm: is there already" in reported("--grid", tmp_path / "map.yaml")
+    assert "a grid is a .yaml" in reported("--grid", tmp_path / "map.png")  # said first
 
 
 def test_an_export_never_replaces_the_run_itself(
