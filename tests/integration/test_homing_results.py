@@ -7,14 +7,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+import equal_corridors
 import mirror_door
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import TwoViewVector
 from fgslam.core.geometry import between, wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.homing.places import PathPlaces
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import DRIVING
 from fgslam.runs.config import load_experiment
 from fgslam.runs.run import run_experiment
@@ -92,3 +96,34 @@ def test_near_a_mirror_door_no_vector_is_surely_that_of_the_reflection() -> None
             assert (np.abs(off) <= np.maximum(3.0 * sigma, np.deg2rad(1.0))).all()
             answered += 1
     assert answered >= 6
+
+
+def test_between_equal_sections_of_a_corridor_no_place_is_wrong_and_no_vector_too_sure() -> None:
+    """Two images of different sections show the same: what tells them apart is the way."""
+
+    def along(metres: float) -> FloatArray:
+        return np.array([metres, 0.0, 0.0] if metres <= 24.0 else [24.0, metres - 24.0, np.pi / 2])
+
+    extractor = OmniFeatureExtractor(equal_corridors.CAMERA, DRIVING.features)
+    taught = np.arange(4.0, 36.0, 2.0)
+    driven = [*np.arange(4.5, 35.0, 2.0), *np.arange(9.5, 18.0)]  # carried back on the way
+    rng, number = np.random.default_rng(5), itertools.count()
+    off_way = rng.normal(0.0, [0.15, 0.15, 0.1], (len(driven), 3))
+    path = PathMemory.of(
+        [extractor.extract(equal_corridors.picture(along(s), next(number))) for s in taught]
+    )
+    places, known, vectors = PathPlaces(path, DRIVING), 0, 0
+    for metres, off in zip(driven, off_way, strict=True):
+        pose = along(metres) + off
+        place = places.look(extractor.extract(equal_corridors.picture(pose, next(number))))
+        if place.sure:
+            known += 1
+            assert abs(metres - taught[place.nearest]) <= 3.0
+        if place.vector is not None:
+            vectors += 1
+            x, y, turn = between(pose, along(taught[place.target]))
+            missed = [place.vector.direction - np.arctan2(y, x), place.vector.rotation - turn]
+            sigma = np.sqrt(np.diag(place.vector.covariance))
+            assert (np.abs(wrap(np.array(missed))) <= np.maximum(3.0 * sigma, 0.02)).all()
+    assert known >= 12
+    assert vectors >= 8

@@ -8,6 +8,7 @@ chance, no different solution comes near it, and the other matches show no secon
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,6 +61,9 @@ of 10 answers that are off by more than 10 degrees have more, and 2 of the 65 ot
 _SECTORS = 8  # of 45 degrees: what is seen in one has its errors in common, see `rival_probability`
 _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 _LEVEL = float(chi2.ppf(0.95, 5))  # of the prior's strain: level cameras keep within
+_DRIVEN, _CARRIED = (2, 2), (5, 10)
+"""Matches that determine a motion, and its solutions at most: on the plane the two-point problem,
+else the essential matrix (Nistér 2004). More freedom is more hypotheses that chance may support."""
 _FREE = (np.deg2rad(5.0), 1.0)
 """Prior of a camera that is carried: tilts at which nearly all features are still matched
 (docs/results/homing.md), and a height of a whole leg, up stairs or down to the ground."""
@@ -120,23 +124,25 @@ class HomingSearch:
         if at_target is not None:
             return at_target
         carried = self._carried(refined, candidates)
-        answer = self._judged(carried or refined)
+        answer = self._judged(carried, _CARRIED) if carried else self._judged(refined, _DRIVEN)
         if answer and not carried and self._refinement.strain(refined[0]) > _LEVEL:
             # Neither level nor clearly tilted: the sigma holds for neither. Of 285 answers in a
             # rendered house 14 are so; 9 of these are beyond three sigma, of the others 36.
             return replace(answer, wrong_probability=0.5)
         return answer
 
-    def _judged(self, refined: list[Refined]) -> TwoViewVector | Refusal:
+    def _judged(self, refined: list[Refined], sample: tuple[int, int]) -> TwoViewVector | Refusal:
         s, best = self._settings, refined[0]
         competitors = [r for r in refined[1:] if self.differ(r, best)]
-        covariance = self.covariance(refined)
-        self.direction_sigma = float(np.sqrt(covariance[0, 0]))
-        refusal = self.refusal(best, competitors, self.direction_sigma)
+        covariance, refusal = self.covariance(refined), self.refusal(best, competitors, sample)
         if refusal is None:
             covariance, refusal = self._with_second_motions(best, covariance)
+        self.direction_sigma = float(np.sqrt(covariance[0, 0]))
         if refusal is not None:
             return refusal
+        if self.direction_sigma > np.deg2rad(s.max_direction_sigma_deg):
+            text = f"direction is uncertain by {np.rad2deg(self.direction_sigma):.1f} deg"
+            return Refusal(RefusalReason.UNCERTAIN, text)
         theta, psi = (float(v) for v in best.parameters[:2])
         support = max((self.independent_inliers(r.inliers) for r in competitors), default=0)
         floor = np.deg2rad([s.direction_floor_deg, s.rotation_floor_deg])
@@ -352,12 +358,12 @@ class HomingSearch:
         return self._score_of(best) - self._score_of(competitor) < self._settings.rival_log_odds
 
     def refusal(
-        self, best: Refined, competitors: list[Refined], direction_sigma: float
+        self, best: Refined, competitors: list[Refined], sample: tuple[int, int] = _DRIVEN
     ) -> Refusal | None:
-        """Why the best solution is no answer, or None."""
+        """Why the best solution is no answer, or None; its uncertainty aside."""
         s = self._settings
         support = self.independent_inliers(best.inliers)
-        alarms = self._log_false_alarms(best)
+        alarms, *without_sector = self._log_false_alarms(best, sample)
         if support < s.min_inliers:
             reason = RefusalReason.TOO_FEW_INLIERS
             text = f"{support} inliers of {len(self._matches)}"
@@ -367,33 +373,39 @@ class HomingSearch:
                 f"{support} inliers of {len(self._matches)} matches may be chance "
                 f"(1e{alarms / np.log(10.0):.1f} expected)"
             )
+        elif max(without_sector) > 0.0:
+            reason = RefusalReason.TOO_FEW_INLIERS
+            text = f"of {support} inliers those outside an eighth of a view may be chance"
         elif undecided := [r for r in competitors if self._undecided(best, r)]:
             reason = RefusalReason.AMBIGUOUS
             other = self.independent_inliers(undecided[0].inliers)
             text = f"{support} inliers, {other} for a different solution"
-        elif direction_sigma > np.deg2rad(s.max_direction_sigma_deg):
-            reason = RefusalReason.UNCERTAIN
-            text = f"direction is uncertain by {np.rad2deg(direction_sigma):.1f} deg"
         else:
             return None
         return Refusal(reason, text)
 
-    def _log_false_alarms(self, best: Refined) -> float:
+    def _log_false_alarms(self, best: Refined, sample: tuple[int, int]) -> list[float]:
         """Log of the number of equally supported hypotheses expected if all matches were wrong.
 
-        How often a wrong match agrees with this hypothesis is read off wrong matches: the same
-        features paired at random (an *a contrario* test, Moisan and Stival 2004).
+        By all inliers first, then by those outside each sector of either view: one thing seen in
+        both views that is another one of its kind fits some motion exactly. How often a wrong match
+        agrees with this hypothesis is read off wrong matches: the same features paired at random
+        (an *a contrario* test, Moisan and Stival 2004).
         """
         n, sigmas = len(self._matches), INLIER_SIGMAS
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
-        every = np.tile(np.arange(n), _SHUFFLES)
-        wrong = EpipolarTest.of(re_paired(self._matches, every, shuffled), self._tilt)
+        first = np.tile(np.arange(n), _SHUFFLES)
+        wrong = EpipolarTest.of(re_paired(self._matches, first, shuffled), self._tilt)
         good, _ = wrong.inliers(best.parameters[:1], best.parameters[1:2], sigmas, LEAST_PARALLAX)
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
         kept = _one_a_cell(gains, self.match_cells)
-        tests = float(np.log(n * (n - 1.0)))  # two solutions for each pair
-        return tests - log_likelihood_ratio(gains[kept], self._right[kept])
+        middles = np.arange(2 * _SECTORS) * (np.pi / _SECTORS)
+        every = [kept]
+        for bearing in (self._matches.bearing_a[kept], self._matches.bearing_b[kept]):
+            every += [kept[np.abs(wrap(bearing - c)) > np.pi / _SECTORS] for c in middles]
+        tests = math.log(sample[1] * math.comb(max(n, sample[0]), sample[0]))
+        return [tests - log_likelihood_ratio(gains[k], self._right[k]) for k in every]
 
 
 def _spread(bearing: FloatArray) -> float:
@@ -797,7 +809,9 @@ class SecondLook:
         inliers = np.zeros(self._count, np.bool_)
         inliers[best.rows] = True
         support = len(rivals[0].rows) if rivals else 0
-        return TwoViewVector(theta, psi, covariance + np.diag(floor**2), inliers, support)
+        # As of a first look: neither level nor clearly tilted.
+        wrong = 0.5 if self._refinement.strain(best.refined) > _LEVEL else 0.0
+        return TwoViewVector(theta, psi, covariance + np.diag(floor**2), inliers, support, wrong)
 
     def _solutions(self, hypotheses: FloatArray) -> list[_Solution]:
         """The most promising ones, refined, the best first."""
