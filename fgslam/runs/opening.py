@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 from fgslam.core.errors import ConfigError
@@ -52,4 +53,6 @@ def open_sequence(config: ExperimentConfig, progress: Progress | None = None) ->
     recording = open_recording(dataset, noise)
     if isinstance(config.odometry, SyntheticOdometrySettings):
         return with_synthetic_odometry(recording, config.odometry, config.seed)
+    if noise is None:  # constant velocity needs none: one that cannot be read hurts nobody then
+        return replace(recording, odometry_source=None)
     return recording

@@ -128,6 +128,17 @@ def driven(root: Path, topic: str) -> Path:
     return bag(root, stereo() + odometry(stamps, poses, topic))
 
 
+def broken_odometry(root: Path) -> Path:
+    stamps = [START_NS + k * PERIOD_NS for k in range(4)]
+    return bag(root, stereo() + odometry(stamps, np.full((4, 4), np.nan)))
+
+
+def black_image(root: Path) -> Path:
+    for side in ("left", "right"):
+        save(pairs(root) / side / "0.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    return root
+
+
 def uncalibrated_euroc(root: Path) -> Path:
     euroc(root, (np.eye(4), APART))
     for path in root.glob("mav0/cam*/sensor.yaml"):
@@ -426,6 +437,18 @@ OF_RECORDINGS = {
         four_in_a_bag, r"those two: fgslam camera convert \S+ (two.yaml --cameras 0,1)",
         r"--camera {}/two.yaml", lambda root: two_of_four(root),
         command=("inspect", "--camera {}/camchain.yaml"), drop="--camera {}/camchain.yaml",
+    ),
+    "one topic": Advice(
+        lambda root: bag(root, stereo()), r"1 topics of images are named; name the left camera's",
+        "--topics /cam/left/image_raw,/cam/right/image_raw",
+        command=("inspect", "--topics /cam/left/image_raw"), drop="--topics /cam/left/image_raw",
+    ),
+    "odometry that is not finite": Advice(
+        broken_odometry, r"not finite; set another (odometry.kind)",
+        r"--set \1=constant_velocity"
+    ),
+    "a black image": Advice(
+        black_image, r"leave them out with (dataset.start) and dataset.stop", r"--set \1=1"
     ),
     "EuRoC without calibration": Advice(
         uncalibrated_euroc, r"give a calibration by (--camera) FILE", r"\1 {}/mine.json"

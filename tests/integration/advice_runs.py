@@ -75,13 +75,25 @@ def twice(root: Path) -> Path:
     return run_folder(root)
 
 
-def of_other_versions(root: Path) -> Path:
-    given = interrupted(root)
-    path = root / "o" / "config.yaml"
-    text = yaml.safe_load(path.read_text(encoding="utf-8"))
-    text["provenance"]["versions"]["numpy"] = "0.1"
-    path.write_text(yaml.safe_dump(text), encoding="utf-8")
-    return given
+def begun_with(group: str, value: Any) -> Callable[[Path], Path]:
+    """An interrupted run whose provenance states another value of a group."""
+
+    def make(root: Path) -> Path:
+        given = interrupted(root)
+        path = root / "o" / "config.yaml"
+        text = yaml.safe_load(path.read_text(encoding="utf-8"))
+        held = text["provenance"]
+        held[group] = held[group] | value if isinstance(value, dict) else value
+        path.write_text(yaml.safe_dump(text), encoding="utf-8")
+        return given
+
+    return make
+
+
+def damaged_sweep(root: Path) -> Path:
+    (root / "s").mkdir()
+    (root / "s" / "sweep.yaml").write_text("experiments: 3\n", encoding="utf-8")
+    return experiment(root)
 
 
 def damaged_state(root: Path) -> Path:
@@ -163,7 +175,16 @@ OF_RUNS = {
         command=("run", "--out {}/o --set seed=9 --resume"), drop="--resume",
     ),
     "resumed with other packages": Advice(
-        of_other_versions, r"numpy 0.1 -> .* or start again with (--overwrite)", r"\1",
+        begun_with("versions", {"numpy": "0.1"}), r"numpy 0.1 -> .* or start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "resumed with another recording": Advice(
+        begun_with("dataset", {"identity": "x"}),
+        r"recording has changed since .* or start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "resumed with another log": Advice(
+        begun_with("log", "x"), r"begun with log x, .* or start again with (--overwrite)", r"\1",
         command=("run", "--out {}/o --resume"), drop="--resume",
     ),
     "a damaged state": Advice(
@@ -302,6 +323,15 @@ OF_RUNS = {
         experiment, r"(--jobs) is for workers of this machine",
         command=("sweep", "--out {}/s --set seed=1 --jobs 1 --scheduler tcp://127.0.0.1:1"),
         drop="--scheduler tcp://127.0.0.1:1",
+    ),
+    "a sweep that cannot be read": Advice(
+        damaged_sweep, r"cannot be read; start again with (--overwrite)", r"\1",
+        command=("sweep", "--out {}/s --jobs 1 --set seed=1 --resume"), drop="--resume",
+    ),
+    "no column of a sweep": Advice(
+        experiment, r"--metric nosuch: no column of numbers; known: (\w+)", r"--metric \1 --out {}/t",
+        command=("sweep", "--jobs 1 --set seed=1 --out {}/s --metric nosuch"),
+        drop="--out {}/s --metric nosuch",
     ),
     "covariances of one of two": Advice(
         two_estimates, r"judge them one by one",

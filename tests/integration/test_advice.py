@@ -81,8 +81,8 @@ def messages(folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("rooms", "most"),
     [
-        (("datasets", "cameras"), 43),
-        pytest.param(("",), 127, marks=pytest.mark.slow),
+        (("datasets", "cameras"), 37),
+        pytest.param(("",), 120, marks=pytest.mark.slow),
     ],
 )
 def test_messages_that_name_an_option_are_provoked_more_and_more(
