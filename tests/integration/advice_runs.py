@@ -175,7 +175,8 @@ OF_RUNS = {
         command=("run", "--out {}/o --set seed=9 --resume"), drop="--resume",
     ),
     "resumed with other packages": Advice(
-        begun_with("versions", {"numpy": "0.1"}), r"numpy 0.1 -> .* or start again with (--overwrite)", r"\1",
+        begun_with("versions", {"numpy": "0.1"}),
+        r"numpy 0.1 -> .* or start again with (--overwrite)", r"\1",
         command=("run", "--out {}/o --resume"), drop="--resume",
     ),
     "resumed with another recording": Advice(
@@ -329,7 +330,8 @@ OF_RUNS = {
         command=("sweep", "--out {}/s --jobs 1 --set seed=1 --resume"), drop="--resume",
     ),
     "no column of a sweep": Advice(
-        experiment, r"--metric nosuch: no column of numbers; known: (\w+)", r"--metric \1 --out {}/t",
+        experiment, r"--metric nosuch: no column of numbers; known: (\w+)",
+        r"--metric \1 --out {}/t",
         command=("sweep", "--jobs 1 --set seed=1 --out {}/s --metric nosuch"),
         drop="--out {}/s --metric nosuch",
     ),
