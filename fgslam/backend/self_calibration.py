@@ -555,7 +555,8 @@ _KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motio
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
 _SCENE = 4.0
 """Times the least spread of a window: errors twice as large are the scene's. A blurred image has
-ten to eighty times that, and is so much less evidence; else the rig would seem knocked."""
+ten to eighty times that, and is so much less evidence; else the rig would seem knocked. On
+recordings that it was not chosen on sound windows have 2.8 at most, blurred ones 9 to 25."""
 _LANDMARKS = 300  # of a window: all that a street shows, 500, make it surer by a tenth
 _CELLS = np.array([8, 6])  # of the image, across and down, over which they are spread
 _DAMPING = 1e-6
