@@ -53,6 +53,6 @@ def open_sequence(config: ExperimentConfig, progress: Progress | None = None) ->
     recording = open_recording(dataset, noise)
     if isinstance(config.odometry, SyntheticOdometrySettings):
         return with_synthetic_odometry(recording, config.odometry, config.seed)
-    if noise is None:  # constant velocity needs none: one that cannot be read hurts nobody then
+    if noise is None:  # constant velocity needs none, so one that cannot be read does no harm
         return replace(recording, odometry_source=None)
     return recording
