@@ -28,7 +28,8 @@ _ALONG = np.eye(2, dtype=np.float32)  # in which the left and the top image are 
 _HALF = np.float32(0.5)
 _FLAT = 1e-3  # grey levels squared a pixel: no gradient at all
 # Variance of a disparity: what no residual shows, residuals that neighbours have in common, and the
-# square of how far a disparity is off the mean around it.
+# square of how far a disparity is off the mean around it. Chosen in the lab; in offices twice or
+# half of either moves what is within one sigma from 93 to 92 or 93 % (dense_map.md).
 _FLOOR_PX, _CORRELATED, _EDGE = 0.05, 4.0, 2.0
 
 
