@@ -153,7 +153,7 @@ def test_isam2_takes_linear_factors_for_those_that_call_back(
 
 def test_an_offset_is_found_and_stated_with_its_deviation() -> None:
     """The filter of single landmarks takes it for noise of each measurement."""
-    world = drive(("position", "offset_range"), frames=60)
+    world = drive(("position", "offset_range"), frames=40)
     by_odometry = world.ate(fg.replay(world.log, "odometry").estimate)
     for kind in (*ESTIMATORS, "invariant_ekf"):
         found = fg.replay(world.log, kind)
