@@ -48,7 +48,6 @@ from fgslam.runs.slam_comparison import (
     with_odometry,
 )
 from fgslam.runs.tables import ate_table, write_comparison_csv
-from fgslam.runs.tasks.homing_replay import open_homing_comparison
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
@@ -227,6 +226,8 @@ def compare_runs(
         if isinstance(config, ExperimentConfig):
             task = open_slam_comparison(config, run, estimators)
         else:
+            from fgslam.runs.tasks.homing_replay import open_homing_comparison  # loads Plotly
+
             task = open_homing_comparison(config, run, estimators)
         opened.append((with_estimators(config, estimators), task))
     # No results replace earlier ones unasked, or the run that they are made from.

@@ -35,7 +35,6 @@ from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
 from fgslam.runs.sweep import SEED, Axis, Plan, SweepResult, make_plan, read_source, run_sweep
-from fgslam.runs.tasks.homing_replay import open_trials
 from fgslam.runs.units import Progress, Stopped
 from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
@@ -298,6 +297,8 @@ def run_trials(
     if isinstance(seeds, int):
         seeds = range(config.seed, config.seed + seeds)
     if isinstance(config, HomingTrialsConfig):
+        from fgslam.runs.tasks.homing_replay import open_trials  # loads Plotly
+
         chosen = with_estimators(config, estimators)
         chosen = chosen.model_copy(update={"trials": len(seeds), "seed": seeds.start})
         return run_task(open_trials, chosen, folder, existing, progress, stopped, jobs)

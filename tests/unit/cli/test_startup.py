@@ -60,6 +60,11 @@ def test_a_run_of_the_paper_s_filter_loads_no_solver_of_graphs_and_nothing_that_
     assert loaded(code) == {"numpy", "scipy", "cv2", "yaml"}
 
 
+def test_the_library_loads_nothing_that_draws_before_it_is_asked() -> None:
+    code = "import sys, fgslam; fgslam.run, fgslam.sweep, fgslam.compare; print(*sys.modules)"
+    assert not loaded(code) & {"plotly", "matplotlib", "pandas", "distributed"}
+
+
 def limited_to(limit: int, *command: str) -> subprocess.CompletedProcess[str]:
     """A command, ended, that may use so many bytes of address space."""
     return subprocess.run(  # noqa: S603
