@@ -181,6 +181,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
         compared = landmark_errors(estimate.landmarks, truth.landmarks, eTt)
     distances, of_landmarks = compared or (np.empty(0), Nees(np.empty(0), np.empty(0, np.int64)))
     judged = judge([of_landmarks])
+    remarks = [*filter(None, [sound.why, _orientations(final["nees_relative"])])]
     metrics = EstimatorMetrics(
         **{name: final.pop(name) for name in _OF_CONTRACT},
         drift_percent=first.drift_percent,
@@ -209,10 +210,10 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             # Se et al. (5) measure by it how well a loop closes.
             "end_against_start": end_pose(estimate.trajectory),
             "noise_factor": estimate.noise_factor,
-            "remarks": [*estimate.remarks, *filter(None, [sound.why])],
+            "remarks": [*estimate.remarks, *remarks],
             "judged_poses": first.matched_poses,
             "truth_left_out": sound.left_out.tolist(),
-            "truth_remark": sound.why or None,
+            "truth_remark": "; ".join(remarks) or None,
         },
     )
     return Judgement(metrics, {"pose": pose_nees, "landmark": of_landmarks})
@@ -329,6 +330,22 @@ def _length_nees(motions: FloatArray, truths: FloatArray, covariances: FloatArra
     long = lengths**4 > _LONG**2 * variances
     squared = ((lengths - true) * lengths)[long] ** 2 / variances[long]
     return float(squared.mean()) if long.any() else None
+
+
+def _orientations(relative: Mapping[str, Any]) -> str:
+    """That lengths of motions are what the covariances let expect, and whole motions are not."""
+    judged = [one for one in relative.values() if one and one["lengths"] is not None]
+    if not judged or any(
+        one["verdict"] != "overconfident" or one["lengths"] > one["upper"] for one in judged
+    ):
+        return ""
+    whole, lengths = (
+        ", ".join(f"{one[name]:.2g}" for one in judged) for name in ("per_dof", "lengths")
+    )
+    return (
+        f"lengths of motions agree with the truth (NEES {lengths}), whole motions do not ({whole}):"
+        " the truth's orientations are off, or the path's are less certain than stated"
+    )
 
 
 def _coverage(errors: FloatArray, covariances: FloatArray) -> JsonValue:

@@ -456,7 +456,7 @@ def metres(value: float | None) -> str:
     """A length to be read: centimetres below a metre."""
     if value is None:
         return "unknown"
-    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
+    return f"{100.0 * value:.2f} cm" if abs(value) < 1.0 else f"{value:.3f} m"
 
 
 # --------------------------------------------------------------------------------------------

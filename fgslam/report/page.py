@@ -210,7 +210,8 @@ def headline(data: ReportData) -> tuple[str, ...]:
     lines += [_accuracy(data, working)] if working else ["No estimator gave a result."]
     lines += [*_consistency(working), *_cost(working)]
     # By how much, differs from one to the next: each has its own among the remarks.
-    lines += [f"{e.truth_remark.capitalize()}." for e in working if e.truth_remark][:1]
+    whys = [e.truth_remark for e in working if e.truth_remark]
+    lines += [f"{why[:1].upper()}{why[1:]}." for why in whys[:1]]
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     return tuple(lines)
 

@@ -45,7 +45,8 @@ class EstimatorReport:
         update_ms: (n,) milliseconds a frame; NaN where not timed.
         ate_m: absolute trajectory error of the final path, after SE3 alignment.
         matched_poses: of how many poses; judged_poses: and NEES.
-        truth_remark: which true poses are left out of all but the first, and why.
+        truth_remark: which true poses are left out of all but the first, and what else of it is
+            doubtful.
         nees_per_dof: mean NEES of the run per degree of freedom.
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
@@ -206,7 +207,6 @@ def judged_report(
         nees=unknown,
         update_ms=unknown,
         predicted=np.zeros(len(final), np.bool_),
-        truth_remark=sound.why,
         remarks=estimate.remarks,
     )
     located = None if sound.trajectory is None else to_estimate_world(final, sound.trajectory)

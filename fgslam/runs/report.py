@@ -562,6 +562,7 @@ def _estimator(folder: Path, values: dict[str, Any], truth: Trajectory | None) -
         update_ms=update_ms,
         failure=failure,
         predicted=predicted,
+        truth_remark=str(values.get("truth_remark") or ""),
         noise=noise,
         counts=counts,
     )

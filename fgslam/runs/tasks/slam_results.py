@@ -665,8 +665,9 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         # Adding zero turns -0.00 into 0.00.
         known = {name: round(value, 2) + 0.0 for name, value in start.items()}
         rows["end against start"] = (
-            "{x_cm:.2f}, {y_cm:.2f}, {z_cm:.2f} cm\n"
-            "yaw {yaw_deg:.2f}, pitch {pitch_deg:.2f}, roll {roll_deg:.2f} deg".format(**known)
+            "{}, {}, {}\nyaw {yaw_deg:.2f}, pitch {pitch_deg:.2f}, roll {roll_deg:.2f} deg".format(
+                *(metres(known[f"{axis}_cm"] / 100.0) for axis in "xyz"), **known
+            )
         )
     if isinstance(nees, dict):
         band = f"(band {nees['lower']:.2f}-{nees['upper']:.2f}){poses(nees['items'])}"

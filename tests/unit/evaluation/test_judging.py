@@ -154,6 +154,19 @@ def test_verdicts_leave_out_a_truth_that_settles() -> None:
     assert "truth of frames 0 to 3 is off by 2.0 degrees" in judged.more["truth_remark"]
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 1.0])
+def test_orientations_that_alone_contradict_the_truth_are_named(turned_deg: float) -> None:
+    """Each true pose is turned in its place: lengths of motions stay as they are."""
+    found, true, rng = estimate(0.0), loop(40), np.random.default_rng(0)
+    turns = np.radians(turned_deg) * rng.normal(size=(40, 3))
+    turns = np.array([se3_exp(np.concatenate([turn, np.zeros(3)])) for turn in turns])
+    relative = {k: np.tile(0.001**2 * np.eye(6), (40 - k, 1, 1)) for k in (1, 5)}
+    answer = with_times(dataclasses.replace(found, relative=relative), np.ones(40))
+    truth = Truth(Trajectory(true.timestamps, true.poses @ turns))
+    why = judge_answer(answer, truth).metrics.more["truth_remark"]
+    assert ("the truth's orientations are off" in (why or "")) == (turned_deg > 0.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "ends", "online"),
     [
