@@ -59,6 +59,7 @@ class Isam2Solver(WholeGraphSolver):
         self._graph = gtsam.NonlinearFactorGraph()
         self.new_values = gtsam.Values()
         self._updated = 0
+        self._rebuilt = 0  # last frame of the tree's last rebuilding
         self._linear = LinearFactors()
 
     def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
@@ -172,11 +173,17 @@ class Isam2Solver(WholeGraphSolver):
         return refine(self.builder, self._with(self.new_values), self._minimise)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Rebuilds the tree, of the new measurements."""
+        """Rebuilds the tree, of the new measurements.
+
+        That costs as much as the drive is long: only where the rig is known from twice as many
+        frames, so that all rebuildings together cost as two of the last. The answer is solved of
+        all measurements as they are known.
+        """
         super().recalibrate(change)
-        together = self._with(self.new_values)
-        if together.empty():
+        known, then = self.builder.frames[-1:], self._rebuilt - change.since
+        if not known or known[0] - change.since < 2 * then:
             return
+        together = self._with(self.new_values)
         self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         try:
             self._rebuild(together)
@@ -211,6 +218,7 @@ class Isam2Solver(WholeGraphSolver):
         return None
 
     def _rebuild(self, values: Any) -> None:
+        self._rebuilt = self.builder.frames[-1]
         self.tree, self._linear = self.new_tree(), LinearFactors()
         graph, every = self.builder.kept_factors(callbacks=False), self.builder.measured.values()
         self._linear.measured += [one for one in every if not one.model.has_factor]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
+from fgslam.backend.smoothers.isam2 import Isam2Solver
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.correction import displacements, term_names
@@ -125,6 +126,26 @@ def test_a_correction_found_after_the_first_window_leaves_no_contradiction(
     increments = known_from(WINDOW, 2.0, drive)
     # With an exact rig 0.0017 m; where the map does not follow, 0.015 to 0.048 m.
     assert last_steps(increments, kind, drive.poses) < 0.006
+
+
+def test_a_tree_is_rebuilt_for_the_rig_where_the_drive_is_twice_as_long(
+    drive: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rebuilt with every correction, a drive of 200 frames would take twice as long."""
+    increments = [
+        dataclasses.replace(each, rig_correction=yaw(0.01 * k))
+        for k, each in enumerate(drive.increments)
+    ]
+    trees, new_tree = list[int](), Isam2Solver.new_tree
+    estimator = make_estimator(RIG, Isam2Settings())
+
+    def counted(solver: Isam2Solver) -> Any:
+        trees.append(solver.builder.frames[-1])
+        return new_tree(solver)
+
+    monkeypatch.setattr(Isam2Solver, "new_tree", counted)
+    play(estimator, increments)
+    assert trees == [0, 1, 2, 4, 8]
 
 
 def test_landmarks_seen_last_before_a_knock_stay(drive: Simulation) -> None:
