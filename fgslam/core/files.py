@@ -7,6 +7,7 @@ interrupted run leaves the previous version or none, never half a file.
 from __future__ import annotations
 
 import errno
+import hashlib
 import itertools
 import os
 import re
@@ -177,6 +178,26 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file atomically. Raises OutputError when it cannot be written."""
     with replacing(path) as partial:
         partial.write_bytes(content)
+
+
+_DIGEST = 32  # bytes before what is kept: by them a damaged file is known
+
+
+def cached(path: Path) -> bytes | None:
+    """What :func:`keep_cached` kept in a file; None where it is not, or damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, kept = content[:_DIGEST], content[_DIGEST:]
+    return kept if hashlib.sha256(kept).digest() == digest else None
+
+
+def keep_cached(path: Path, content: bytes) -> None:
+    """Keeps what takes time to make where the cache can be written; else it is made again."""
+    with suppress(OSError, OutputError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, hashlib.sha256(content).digest() + content)
 
 
 def write_text(path: Path, content: str) -> None:

@@ -21,10 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.errors import OutputError
-from fgslam.core.files import cache_root, write_bytes
+from fgslam.core.files import cache_root, cached, keep_cached
 
-_DIGEST = 32  # bytes before the code: by them a damaged file is known
 _NUMBERS: dict[str, Any] = {"i8": ctypes.c_int64, "f8": ctypes.c_double}
 _STATUS = ctypes.create_string_buffer(16)  # of numba's calls: a result and an exception, unused
 KERNELS: list[Kernel] = []  # of all imported modules
@@ -73,7 +71,7 @@ class Kernel:
     @property
     def is_made(self) -> bool:
         """Whether calling it takes no more than loading."""
-        return self._call is not None or not _has_numba() or self._kept() is not None
+        return self._call is not None or not _has_numba() or cached(self._file()) is not None
 
     def load(self) -> None:
         """Loads the machine code, which is made where the cache does not have it."""
@@ -82,7 +80,7 @@ class Kernel:
             return
         import llvmlite.binding as llvm
 
-        code = self._kept() or self._made()
+        code = cached(self._file()) or self._made()
         types: list[Any] = [ctypes.c_void_p] * 2
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -114,21 +112,8 @@ class Kernel:
         if unknown:  # LLVM would end the process where the code is loaded
             raise TypeError(f"{self._code.__name__} needs numba's own {unknown} at run time")
         code = bytes(_machine().emit_object(module))
-        try:
-            self._file().parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(self._file(), hashlib.sha256(code).digest() + code)
-        except (OSError, OutputError):
-            pass  # the next process makes it again
+        keep_cached(self._file(), code)
         return code
-
-    def _kept(self) -> bytes | None:
-        """The machine code in the cache; None where it is not, or damaged."""
-        try:
-            content = self._file().read_bytes()
-        except OSError:
-            return None
-        code = content[_DIGEST:]
-        return code if hashlib.sha256(code).digest() == content[:_DIGEST] else None
 
     def _file(self) -> Path:
         """In the cache, named by all that the code depends on."""

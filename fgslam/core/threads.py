@@ -11,10 +11,28 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import util
 from typing import Any
 
-import scipy.linalg  # noqa: F401  its BLAS is not NumPy's, and a limit reaches what is loaded
+import numpy as np
 from threadpoolctl import ThreadpoolController
+
+
+def _load_when_used(name: str) -> None:
+    """A part of NumPy that is loaded with its first use."""
+    spec = util.find_spec(whole := f"numpy.{name}")
+    if whole in sys.modules or spec is None or spec.loader is None:
+        return
+    spec.loader = util.LazyLoader(spec.loader)
+    sys.modules[whole] = module = util.module_from_spec(spec)
+    setattr(np, name, module)
+    spec.loader.exec_module(module)
+
+
+# SciPy asks for all parts of NumPy, and would load a compiler's and a test runner's for 0.1 s.
+for _part in ("f2py", "testing"):
+    _load_when_used(_part)
+import scipy.linalg  # noqa: E402,F401  its BLAS is not NumPy's, and a limit reaches what is loaded
 
 
 class BlasLimits:

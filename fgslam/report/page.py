@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.files import write_text
+from fgslam.core.files import cache_root, cached, keep_cached, write_text
 from fgslam.report import figures as drawn
 from fgslam.report.content import Drive, Page, Picture, metres, plain
 from fgslam.report.results import EstimatorReport, ReportData
@@ -100,12 +100,20 @@ def _moves(drive: Drive | None) -> str:
 
 @lru_cache(maxsize=1)
 def _plotly() -> tuple[str, str]:
-    """Plotly's script, packed, and the digest under which the page lets it run."""
+    """Plotly's script, packed, and the digest under which the page lets it run; both cached."""
+    import plotly
     from plotly.offline import get_plotlyjs
 
-    # As the browser's parser hands a script on, so that its digest is the same there.
-    script = str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")
-    return _packed(script), _digest(script)
+    ground = plotly.__version__ + Path(__file__).read_text(encoding="utf-8")
+    file = cache_root() / "page" / f"plotly-{hashlib.sha256(ground.encode()).hexdigest()[:20]}"
+    kept = cached(file)
+    if kept is None:
+        # As the browser's parser hands a script on, so that its digest is the same there.
+        script = str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")
+        kept = (_digest(script) + _packed(script)).encode("utf-8")
+        keep_cached(file, kept)
+    both, digits = kept.decode("utf-8"), len(_digest(""))
+    return both[digits:], both[:digits]
 
 
 def _packed(text: str) -> str:
