@@ -47,11 +47,14 @@ def _align(  # noqa: PLR0913  kernels take plain arrays
         contrast = max(math.sqrt(max(g[1, 1] / g[0, 0] - (g[0, 1] / g[0, 0]) ** 2, 0.0)), FLAT)
         for _ in range(times):
             sample(grey, scale, places[n], a, size, seen)
-            square, p[:] = 0.0, 0.0
+            # One by one, in registers: an array's would be stored at each pixel.
+            square = p0 = p1 = p2 = p3 = p4 = p5 = p6 = p7 = 0.0
             for k in range(pixels):
-                square += weight[k] * seen[k] * seen[k]
-                for i in range(TERMS):
-                    p[i] += room[k, i] * seen[k]
+                s, b = seen[k], room[k]
+                square += weight[k] * s * s
+                p0, p1, p2, p3 = p0 + b[0] * s, p1 + b[1] * s, p2 + b[2] * s, p3 + b[3] * s
+                p4, p5, p6, p7 = p4 + b[4] * s, p5 + b[5] * s, p6 + b[6] * s, p7 + b[7] * s
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7] = p0, p1, p2, p3, p4, p5, p6, p7
             n00, n01, n11 = g[0, 0] + FLAT, g[0, 1], g[1, 1] + FLAT
             det = n00 * n11 - n01 * n01
             offset, light = (n11 * p[0] - n01 * p[1]) / det, (n00 * p[1] - n01 * p[0]) / det

@@ -31,22 +31,24 @@ def sample(grey: Any, scale: int, place: Any, linear: Any, size: int, out: Any) 
     far_y = reach * (abs(linear[1, 0]) + abs(linear[1, 1]))
     inside = scale * (place[0] - far_x) >= 0.0 and scale * (place[0] + far_x) < width - 1
     inside &= scale * (place[1] - far_y) >= 0.0 and scale * (place[1] + far_y) < height - 1
+    step_u, step_v = scale * linear[0, 0], scale * linear[1, 0]
     for row in range(size):
         first_u = scale * (place[0] + linear[0, 1] * (row - reach))
         first_v = scale * (place[1] + linear[1, 1] * (row - reach))
         for column in range(size):
-            u = first_u + scale * linear[0, 0] * (column - reach)
-            v = first_v + scale * linear[1, 0] * (column - reach)
+            u = first_u + step_u * (column - reach)
+            v = first_v + step_v * (column - reach)
             if not inside:
                 u = min(u, width - 1.0) if u > 0.0 else 0.0  # what is no number, too
                 v = min(v, height - 1.0) if v > 0.0 else 0.0
-            left, top = int(u), int(v)
-            right, below = left + 1, top + 1
+            left, top = np.uintp(u), np.uintp(v)
+            right, below = left + np.uintp(1), top + np.uintp(1)
             if not inside:
-                right, below = min(right, width - 1), min(below, height - 1)
+                right, below = min(right, np.uintp(width - 1)), min(below, np.uintp(height - 1))
             x, y = u - left, v - top
-            upper = (1.0 - x) * grey[top, left] + x * grey[top, right]
-            lower = (1.0 - x) * grey[below, left] + x * grey[below, right]
+            above, under = grey[top], grey[below]
+            upper = (1.0 - x) * above[left] + x * above[right]
+            lower = (1.0 - x) * under[left] + x * under[right]
             out[row * size + column] = (1.0 - y) * upper + y * lower
 
 
