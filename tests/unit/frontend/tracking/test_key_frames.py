@@ -379,12 +379,15 @@ def test_many_that_contradict_the_pose_ask_for_a_key_frame(outliers: int, lastin
 
 @pytest.mark.parametrize(
     ("left", "likely"),
-    [([], False), ([90], False), ([90, 70], False), ([70, 52], True), ([60], True)],
+    [([], False), ([90, 70], False), ([70, 52], True), ([60], False), ([52], True)],
 )
 def test_a_key_frame_is_expected_where_as_large_a_share_is_lost_again(
     left: list[int], likely: bool
 ) -> None:
-    """Of 100 landmarks 40 must be left: 70 and 52 make 39, 90 and 70 make 54."""
+    """Of 100 landmarks 40 must be left: 70 and 52 make 39, 90 and 70 make 54.
+
+    Of the first loss the root: 60 make 46, 52 make 37.
+    """
     key_frames, key_frame = tracking_of_a_wall()
     key_frame()
     for count in left:
