@@ -28,7 +28,7 @@ from fgslam.core.sensors import (
 from fgslam.core.types import PATCH_PX, Features, StereoFeatures
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
-from fgslam.frontend.features.sift import FineImage
+from fgslam.frontend.features.sift import GREY_NOISE, FineImage
 from fgslam.frontend.settings import AppearanceSettings, StereoSettings
 
 Linear: TypeAlias = tuple[FloatArray, FloatArray]
@@ -287,7 +287,6 @@ def _average(pairs: list[tuple[Features, IntArray]]) -> tuple[FloatArray, FloatA
 # ------------------------------------------------------------------------------------------
 # Features of the reference image alone, measured in the other images by their patches
 
-GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
 DEFORMATION = 0.05  # sigma of a patch's stretching between two images
 ALIGNMENTS_ACROSS = 3  # in another camera's image, from a disparity known to a pixel or two
 _MIN_CORRELATION = 0.8

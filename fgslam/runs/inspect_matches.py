@@ -135,7 +135,7 @@ def match_frames(
         for done, i in enumerate(chosen, 1):
             with suppress(FrameError):
                 frame = sequence.frame(i)
-                features = extractor.extract_all(frame.images, pool)
+                features = tuple(pool.map(extractor.extract, frame.images))
                 for axis, other in enumerate(features[1:]):
                     others[axis].append(_matched(len(numbers), features[0], other, axis))
                 numbers.append(frame.index)

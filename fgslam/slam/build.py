@@ -92,6 +92,7 @@ def make_pipeline(
         tracker.database.load(arrival.saved)
         tracker.keeps_map = not arrival.extends
     stereo = make_stereo(rig, frontend)
+    carrier = None if frontend.tracking == "sift" else LandmarkCarrier(rig, stereo.matcher)
     return SlamPipeline(
         stereo=stereo,
         tracker=tracker,
@@ -101,7 +102,7 @@ def make_pipeline(
             rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
         ),
         calibration=make_calibration(rig, frontend, memory),
-        key_frames=make_key_frames(rig, frontend, tracker, stereo.matcher),
+        key_frames=None if carrier is None else KeyFrameTracker(tracker, carrier),
         stated=np.zeros(len(term_names(rig))) if of_depth else None,
         watch=CameraWatch(rig) if frontend.watch_cameras and not of_depth else None,
         located=prior if arrival is not None and arrival.relocalised else None,
@@ -322,15 +323,6 @@ def calibrates_itself(settings: FrontendSettings) -> bool:
 def has_depth_camera(settings: FrontendSettings) -> bool:
     """Whether the left camera is made up from depth: one that cannot have moved, or be late."""
     return settings.stereo.disparity_sigma_px is not None
-
-
-def make_key_frames(
-    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker, matcher: StereoMatcher
-) -> KeyFrameTracker | None:
-    """Tracking between key frames; None where every frame is one."""
-    if settings.tracking == "sift":
-        return None
-    return KeyFrameTracker(tracker, LandmarkCarrier(rig, matcher))
 
 
 def make_stream(

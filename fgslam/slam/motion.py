@@ -57,20 +57,18 @@ class ConstantVelocityMotion:
         the step's standard deviation is ``sigma * T * dt``: ``sigma * dt^2`` from frame to frame,
         and growing while the camera is blind. Then the velocity fades, too.
         """
-        guess = None if self._timestamp is None else self._guess(timestamp - self._timestamp)
-        if guess is None or body is None or not body.turned:
-            return guess
-        return turned_by(guess, body)
-
-    def _guess(self, dt: float) -> Odometry:
-        if self._velocity is None or self._timestamp is None:
-            return Odometry(np.eye(4), np.diag((START_VELOCITY_SIGMA * dt) ** 2), measured=False)
-        timestamp = self._timestamp + dt
-        wandered = self._noise.variance * (timestamp - self._measured_at) ** 2
-        variance = np.minimum(wandered * dt**2, _LARGEST_SIGMA**2)
-        blind = self._measured_at < self._timestamp
-        velocity = _faded(self._velocity, wandered) if blind else self._velocity
-        return Odometry(se3_exp(velocity * dt), np.diag(variance), measured=False)
+        if self._timestamp is None:
+            return None
+        dt, velocity = timestamp - self._timestamp, self._velocity
+        variance, step = (START_VELOCITY_SIGMA * dt) ** 2, np.eye(4)
+        if velocity is not None:
+            wandered = self._noise.variance * (self._timestamp + dt - self._measured_at) ** 2
+            variance = np.minimum(wandered * dt**2, _LARGEST_SIGMA**2)
+            if self._measured_at < self._timestamp:
+                velocity = _faded(velocity, wandered)
+            step = se3_exp(velocity * dt)
+        guess = Odometry(step, np.diag(variance), measured=False)
+        return guess if body is None or not body.turned else turned_by(guess, body)
 
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         """Updates the velocity from the last two measured poses, its noise from how it changed.
@@ -81,18 +79,14 @@ class ConstantVelocityMotion:
         wTc = pose.wTc
         if measured and self._founded:
             step, dt = inverse(self._pose) @ wTc, timestamp - self._measured_at
-            self._learn(step, np.diagonal(pose.covariance), dt)
+            if self._velocity is not None:
+                innovation = se3_log(se3_exp(-self._velocity * dt) @ step)
+                self._noise.learn(innovation, np.diagonal(pose.covariance), dt**2)
             self._velocity = se3_log(step) / dt
         if measured or not self._founded:
             self._measured_at, self._pose = timestamp, wTc
         self._founded |= measured
         self._timestamp = timestamp
-
-    def _learn(self, step: FloatArray, left: FloatArray, dt: float) -> None:
-        """A step (4, 4) over ``dt`` seconds relative to the one that the velocity made expect."""
-        if self._velocity is not None:
-            innovation = se3_log(se3_exp(-self._velocity * dt) @ step)
-            self._noise.learn(innovation, left, dt**2)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """Goes on from there with the velocity so far; of one that was carried none is known."""

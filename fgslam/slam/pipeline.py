@@ -462,19 +462,15 @@ def observe(
     if any(stats.closed) or (increment.relocalised and not regained):
         motion.displaced(time, stats.wTc, increment.relocalised)
         return
-    measured = regained or _anchored(increment, tracking, stats)
+    founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
+    tied = _known(increment.odometry) or tracking.status.measured  # to odometry or the map
+    measured = regained or tied or founding
     if regained:
         motion.regained(time, wTc)
     else:
         motion.observe(time, Prediction(wTc, tracking.covariance), measured)
     if measured and (stats.wTc != wTc).any():
         motion.displaced(time, stats.wTc, carried=False)
-
-
-def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> bool:
-    """True if odometry or the map determined the pose, or the frame starts the map."""
-    founding = stats.landmarks > 0 and stats.landmarks == int(increment.observations.is_new.sum())
-    return _known(increment.odometry) or tracking.status.measured or founding
 
 
 def _known(odometry: Odometry | None) -> bool:
@@ -518,12 +514,15 @@ def noise_in_use(
         matches: what the ego-motion takes the noise of matches to be.
         estimator: after its update.
     """
-    rotation, translation = _of_motion(motion, odometry)
-    single, correlated = getattr(estimator, "noise_factors", (math.nan, math.nan))
     turned = odometry is not None and odometry.turned
+    rotation, translation = math.nan, math.nan
+    guessed = odometry is not None and not odometry.measured
+    if guessed and isinstance(motion, ConstantVelocityMotion | OdometryMotion):
+        rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
+    single, correlated = getattr(estimator, "noise_factors", (math.nan, math.nan))
     return FrameNoise(
-        rotation_sigma_dps2=rotation,
-        translation_sigma_mps2=translation,
+        rotation_sigma_dps2=math.nan if turned else math.degrees(rotation),
+        translation_sigma_mps2=float(translation),
         gyroscope_factor=(
             motion.gyroscope_factor if turned and isinstance(motion, OdometryMotion) else math.nan
         ),
@@ -531,13 +530,3 @@ def noise_in_use(
         single_factor=single,
         correlated_factor=correlated,
     )
-
-
-def _of_motion(motion: MotionModel, odometry: Odometry | None) -> tuple[float, float]:
-    """Deviations of the acceleration, degrees/s^2 and m/s^2, where the step stands on it."""
-    if odometry is None or odometry.measured:
-        return math.nan, math.nan
-    if not isinstance(motion, ConstantVelocityMotion | OdometryMotion):
-        return math.nan, math.nan
-    rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
-    return math.nan if odometry.turned else math.degrees(rotation), float(translation)

@@ -463,7 +463,9 @@ def checked_images(images: Sequence[npt.ArrayLike], rig: CameraRig) -> tuple[Ima
             f"the images are a {type(images).__name__}; give a tuple ({wanted}), or None where the "
             "cameras gave nothing"
         ) from None
-    if isinstance(images, np.ndarray) and (images.ndim < 3 or _is_colour(images)):
+    if isinstance(images, np.ndarray) and (
+        images.ndim < 3 or (images.ndim == 3 and images.shape[2] in (3, 4))  # of one image
+    ):
         raise FrameError(f"one image given instead of {rig.cameras}; give ({wanted})")
     if given != rig.cameras:
         other = {2: ", or a rig without vertical_baseline", 3: ", or a rig with one more camera"}
@@ -489,11 +491,6 @@ def checked_images(images: Sequence[npt.ArrayLike], rig: CameraRig) -> tuple[Ima
 def _size(rig: CameraRig) -> tuple[int, int]:
     """Width and height of the images that are given."""
     return rig.image_size if isinstance(rig, StereoRig) else (rig.width, rig.height)
-
-
-def _is_colour(image: np.ndarray) -> bool:
-    """Whether an array is one image with colours, and not several images."""
-    return image.ndim == 3 and image.shape[2] in (3, 4)
 
 
 def checked_measurements(given: Iterable[Measured]) -> tuple[Measured, ...]:

@@ -206,7 +206,9 @@ class Smoother:
             if entered.frame == tracked.frame:
                 self._earlier = smoothed.earlier
             if self._segments is not None:
-                last = _moved_on(last, inverse(entered.wTc) @ tracked.wTc)
+                since = inverse(entered.wTc) @ tracked.wTc  # as it was tracked
+                covariance = congruence(adjoint(inverse(since)), last.covariance)
+                last = Prediction(reorthonormalise(last.wTc @ since), covariance)
             self._take_over(smoothed, last)
 
     def _take_over(self, smoothed: Smoothed, current: Prediction) -> None:
@@ -356,12 +358,6 @@ class Smoother:
             raise EstimatorError("only a new estimator can be restored")
         for increment, tracking in unpack(state, list[Input]):
             self.update(increment, tracking)
-
-
-def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
-    """The present frame's pose, as far from the one that entered last as it was tracked."""
-    covariance = congruence(adjoint(inverse(motion)), last.covariance)
-    return Prediction(reorthonormalise(last.wTc @ motion), covariance)
 
 
 class MapSmoother(Smoother):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence as Many
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -47,18 +47,17 @@ class SiftExtractor:
     def extract(self, image: Image) -> Features:
         """Features of one grey image (height, width), in OpenCV's order, which is repeatable.
 
-        With ``contrast: relative`` those that the image would have if it were well exposed, without
-        what is likely to be noise. An image that is well exposed is taken as it is.
+        With ``contrast: relative`` those that the image would have if it were well exposed and not
+        too noisy, without what is likely to be noise. One that is so is taken as it is.
         """
-        share = 1.0 if self._settings.contrast == "absolute" else contrast_share(image)
+        if self._settings.contrast == "absolute":
+            return self._select(*self._found(self._sift, image), noise=0.0)
+        share, noise = contrast_share(image), noise_sigma(image)
+        image = smoothed(image, noise)
         if share == 1.0:
             return self._select(*self._found(self._sift, image), noise=0.0)
         dim = self._detector(share * self._settings.contrast_threshold)
-        return self._select(*self._found(dim, image), noise_sigma(image))
-
-    def extract_all(self, images: Many[Image], pool: Executor) -> tuple[Features, ...]:
-        """Features of several images, one task each."""
-        return tuple(pool.map(self.extract, images))
+        return self._select(*self._found(dim, image), noise)
 
     def _detector(self, contrast_threshold: float) -> cv2.SIFT:
         return cv2.SIFT.create(
@@ -86,7 +85,9 @@ class SiftExtractor:
     ) -> Features:
         """Features of the levels searched that answer more than noise of that sigma would."""
         # Column by column: half the time of one row a key point.
-        level = self._levels_of(np.array([kp.octave for kp in keypoints], np.int64))
+        packed = np.array([kp.octave for kp in keypoints], np.int64)  # octave and layer
+        octave = ((packed & 255) ^ 128) - 128  # signed
+        level = (octave + 1) * OCTAVE_LAYERS + ((packed >> 8) & 255) - 1  # 0: the finest
         by_noise = _NOISE_ANSWER * noise * 2.0 ** (-level / OCTAVE_LAYERS)
         response = np.array([kp.response for kp in keypoints])
         keep = (level < SCALE_LEVELS) & (_WHITE * response >= by_noise)
@@ -97,12 +98,6 @@ class SiftExtractor:
             orientation=np.deg2rad(np.array([kp.angle for kp in keypoints])[keep]),
             descriptors=descriptors[keep],
         )
-
-    def _levels_of(self, packed: IntArray) -> IntArray:
-        """Levels counted from the finest, 0-based, of OpenCV's packed octave and layer."""
-        octave = packed & 255
-        octave = np.where(octave >= 128, octave - 256, octave)
-        return (octave + 1) * OCTAVE_LAYERS + ((packed >> 8) & 255) - 1
 
 
 # ------------------------------------------------------------------------------------------
@@ -117,6 +112,9 @@ _ANSWERS = 8 * 255 + 1  # different sizes that its answers can have
 _LAPLACIAN_GAIN = 6.0  # deviation of its answer to white noise of deviation one
 _MEDIAN_OF_NORMAL = 0.6745  # median of a standard normal variable's absolute value
 _ROUNDING = 12.0**-0.5  # deviation of what rounding to grey levels adds
+GREY_NOISE = 4.0
+"""Sigma of a grey value that the front-end reckons with: noise, and what no affine map does."""
+_SMOOTHING = 2.0 ** np.arange(-1.0, 1.25, 0.25)  # pixels
 
 
 def contrast_share(image: Image) -> float:
@@ -142,6 +140,26 @@ def noise_sigma(image: Image) -> float:
     ranks = np.array([(answers.size - 1) // 2, answers.size // 2])
     median = float(np.searchsorted(counts, ranks, side="right").mean())
     return max(median / (_MEDIAN_OF_NORMAL * _LAPLACIAN_GAIN), _ROUNDING)
+
+
+def smoothed(image: Image, noise: float) -> Image:
+    """The image by the Gaussian that brings it nearest to what it is without noise of that sigma.
+
+    One with no more noise than :data:`GREY_NOISE` stays as it is. The mean squared distance from
+    the image without noise is estimated without knowing that (Stein 1981): of an image y smoothed
+    to G y, with a kernel of g in its middle, by ``mean (y - G y)^2 + noise^2 (2 g - 1)``.
+    """
+    nearest, least = image, noise**2
+    for sigma in _SMOOTHING.tolist() if noise > GREY_NOISE else ():
+        reach = math.ceil(3.0 * sigma)
+        kernel = cv2.getGaussianKernel(2 * reach + 1, sigma)
+        now = cv2.sepFilter2D(image, -1, kernel, kernel)
+        moved = cv2.norm(image, now, cv2.NORM_L2SQR) / image.size
+        risk = moved + noise**2 * (2.0 * float(kernel[reach, 0]) ** 2 - 1.0)
+        if risk >= least:
+            break
+        nearest, least = np.asarray(now, np.uint8), risk
+    return nearest
 
 
 def _up_to(values: Image | npt.NDArray[np.uint16], levels: int) -> IntArray:
@@ -222,15 +240,23 @@ _BEFORE = 2  # of the six pixels: those before the one that the place lies behin
 
 @dataclass(eq=False)
 class FineImage:
-    """A grey image (h, w) uint8, and its values halfway between its pixels, found when needed."""
+    """A grey image (h, w) uint8, and what is found of it when needed."""
 
     image: Image
 
     @cached_property
+    def quiet(self) -> Image:
+        """The image, smoothed where it is noisy."""
+        return smoothed(self.image, noise_sigma(self.image))
+
+    @cached_property
     def grey(self) -> Float32:
-        """(2 h - 1, 2 w - 1): the pixel (column, row) of the image is at (2 column, 2 row)."""
-        height, width = self.image.shape
-        values = self.image.astype(np.float32)  # not rounded: a dark image has few grey values
+        """(2 h - 1, 2 w - 1) with the values halfway between pixels.
+
+        The pixel (column, row) is at (2 column, 2 row).
+        """
+        height, width = self.quiet.shape
+        values = self.quiet.astype(np.float32)  # not rounded: a dark image has few grey values
         out = np.empty((PER_PIXEL * height - 1, PER_PIXEL * width - 1), np.float32)
         out[::2, ::2] = values
         out[::2, 1::2] = _filtered(values, across=True, down=False)[:, :-1]

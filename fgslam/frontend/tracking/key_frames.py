@@ -30,8 +30,8 @@ from fgslam.core.types import (
     StereoFeatures,
 )
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor_at, crowding, cut_out
-from fgslam.frontend.features.sift import FineImage
-from fgslam.frontend.stereo import DEFORMATION, GREY_NOISE, StereoMatcher, across
+from fgslam.frontend.features.sift import GREY_NOISE, FineImage
+from fgslam.frontend.stereo import DEFORMATION, StereoMatcher, across
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 
@@ -424,7 +424,7 @@ class LandmarkCarrier:
     ) -> tuple[ReferencePatches, FloatArray, BoolArray]:
         """Patches as deformed now, places (n, 2), and which (n,) are the same things."""
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            last.image, now.image, self._points.places.astype(np.float32),
+            last.quiet, now.quiet, self._points.places.astype(np.float32),
             predicted[:, :2].astype(np.float32), None, None, (PATCH_PX, PATCH_PX),
             _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
         )  # fmt: skip

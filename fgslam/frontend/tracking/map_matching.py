@@ -217,7 +217,8 @@ class FieldOfView:
         points = points[rows]
         measurement = self._rig.predict(points)
         if self._cone:
-            possible = certain = self._in_cone(points)
+            inside = np.abs(points[:, :2]) < self._tangent * points[:, 2:]
+            possible = certain = np.asarray(inside.all(axis=1))
         else:
             possible = self._in_images(measurement, -BORDER_PX)
             certain = self._in_images(measurement, BORDER_PX)
@@ -241,9 +242,6 @@ class FieldOfView:
             inside &= along <= (size - 1 + reach - centre) * depth
             rows = rows[inside]
         return rows
-
-    def _in_cone(self, points: FloatArray) -> BoolArray:
-        return np.asarray((np.abs(points[:, :2]) < self._tangent * points[:, 2:]).all(axis=1))
 
     def _in_images(self, measurement: FloatArray, border: float) -> BoolArray:
         """True if a landmark projects into all images of the rig, the border excluded."""

@@ -205,7 +205,9 @@ class LandmarkTracker:
             return Association(matched, ~inliers, none, none, matches.features)
         missed_ids = self._missing(tracked) if misses else np.empty(0, np.int64)
         directions = directions_to(tracked.ego_motion.wTc, features.position)
-        upright = self._upright(features, tracked.ego_motion.wTc)
+        # The orientations as a level camera sees them.
+        level = features.orientation - lean(self.rig, tracked.ego_motion.wTc, features.position)
+        upright = replace(features, orientation=level)
         seen = matches.features[inliers]
         self.database.record_hits(matched.ids[inliers], upright, seen, directions[seen])
         self.database.record_misses(missed_ids)
@@ -231,11 +233,6 @@ class LandmarkTracker:
         hit = np.zeros(len(tracked.expected), np.bool_)
         hit[tracked.matches.landmarks[tracked.ego_motion.inliers]] = True
         return self.database.missing(tracked.expected, hit)
-
-    def _upright(self, features: StereoFeatures, wTc: FloatArray) -> StereoFeatures:
-        """The features with their orientations as a level camera sees them."""
-        level = features.orientation - lean(self.rig, wTc, features.position)
-        return replace(features, orientation=level)
 
     def associate_carried(self, tracked: Tracked, features: StereoFeatures) -> Association:
         """Records hits of carried landmarks, between key frames; nothing is missed or new there."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import ndimage
+from scipy.spatial.distance import cdist
 from simulated import assert_same_bits
 
 from fgslam.core.arrays import FloatArray, Image
@@ -144,7 +145,7 @@ def test_parallel_extraction_gives_the_same_features() -> None:
     images = [as_image(texture()), lit(1 / 8, seed=1)]
     extractor = SiftExtractor(SETTINGS, "descriptor")
     with ThreadPoolExecutor(2) as pool:
-        together = extractor.extract_all(images * 2, pool)
+        together = list(pool.map(extractor.extract, images * 2))
     for k, found in enumerate(together):
         assert_same_bits(found, extractor.extract(images[k % 2]))
 
@@ -197,6 +198,30 @@ def test_noise_alone_is_hardly_ever_a_feature(grey: float, sigma: float) -> None
     noise = sigma * np.random.default_rng(3).standard_normal((240, 320))
     image = as_image(np.clip(grey + noise, 0, 255))
     assert len(extract(image)) <= 8
+
+
+def test_more_features_are_recognised_in_a_noisy_image() -> None:
+    """Than without smoothing it first: by their descriptors alone, and in their place."""
+    clean, noisy = extract(lit(1.0)), lit(1.0, 20.0)
+
+    def recognised(**how: object) -> int:
+        found = extract(noisy, **how)
+        distance = cdist(clean.descriptors, found.descriptors)
+        best = distance.argmin(axis=1)
+        mutual = distance.argmin(axis=0)[best] == np.arange(len(best))
+        near = np.linalg.norm(found.xy[best] - clean.xy, axis=1) < 1.0
+        return int((mutual & near).sum())
+
+    assert recognised() > 1.3 * recognised(contrast="absolute")
+
+
+@pytest.mark.parametrize("sigma", [5.0, 10.0, 20.0])
+def test_smoothing_brings_a_noisy_image_nearer_to_the_clean_one(sigma: float) -> None:
+    clean, noisy = texture(), lit(1.0, sigma)
+    off = float(np.mean((sift.smoothed(noisy, sigma) - clean) ** 2))
+    others = [ndimage.gaussian_filter(noisy.astype(float), s) for s in (0.35, 0.5, 0.7, 1.0, 1.4)]
+    assert off < min(float(np.mean((other - clean) ** 2)) for other in others) + 0.05 * sigma**2
+    assert off < 0.7 * sigma**2
 
 
 @pytest.mark.filterwarnings("error")
