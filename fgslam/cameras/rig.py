@@ -558,7 +558,7 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
         raise CalibrationError(
             f"{source}: no place of the rectified view is seen by all of "
             f"{', '.join(camera.name for camera in chosen)}; check how they are turned to each "
-            "other (R, T_BS) and their principal points, or choose a view: dataset.fov_deg, --fov"
+            "other (R, T_BS) and their principal points"
         )
     turns = [np.eye(3)] * len(cameras)
     for k, rotation in zip(sources, view.rotations, strict=True):
@@ -569,7 +569,8 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     if model := calibration.guessed_lens:
         text = f"{source} does not state the model of its four coefficients: taken as {model}"
         other = "equidistant" if model == "radtan" else "radtan"
-        remarks = (*remarks, f"{text}; if they are {other}, say --set dataset.lens={other}")
+        say = f"write distortion_model: {other} there, or say --set dataset.lens={other}"
+        remarks = (*remarks, f"{text}; if they are {other}, {say} of a recording")
     if found.overlap < _LEAST_OVERLAP:
         remarks = (*remarks, f"{source}: cameras share {found.overlap:.0%} of the rectified view")
     if calibration.sided and len(sources) == 2:
@@ -771,7 +772,7 @@ def _view(
         notes = (
             *notes,
             f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-            f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
+            f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg, --fov of fgslam camera, is another angle)",
         )
     return view, notes
 

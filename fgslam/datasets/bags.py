@@ -49,6 +49,7 @@ from fgslam.datasets.depth import (
     sample_depths,
 )
 from fgslam.datasets.images import (
+    LEAVE_OUT,
     Depth,
     bits_held,
     both_views,
@@ -287,7 +288,7 @@ class Bag:
         except DAMAGED as fault:
             raise FrameError(
                 f"a message of {connection.topic} in {self.paths[0]} cannot be decoded ({fault}); "
-                "leave the frame out with dataset.start/stop/stride"
+                f"{LEAVE_OUT}"
             ) from None
 
     def first_frame(self, topic: Topic) -> str:
@@ -433,8 +434,7 @@ class Bag:
         except (StopIteration, DatasetError) as fault:
             self._next = len(self._times)
             raise FrameError(
-                f"message {place} in {self.paths[0]} cannot be read ({fault}); leave the frame out "
-                "with dataset.start/stop/stride"
+                f"message {place} in {self.paths[0]} cannot be read ({fault}); {LEAVE_OUT}"
             ) from None
 
 

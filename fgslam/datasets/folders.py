@@ -24,7 +24,6 @@ from fgslam.datasets.images import (
     first_size,
     list_numbered_images,
     open_frames,
-    require_folder,
 )
 from fgslam.datasets.layouts import files_of, find_cameras, images_in
 from fgslam.datasets.ledger import IMAGES, PAIRING, Entry
@@ -65,7 +64,6 @@ def open_image_folder(
         CalibrationError: calib.json is missing, not finite or impossible.
     """
     root = Path(settings.path)
-    require_folder(root, "the recording")
     cameras = _numbered_images(root)
     own, three = settings.camera_file is None, len(cameras) == 3
     calibration = Path(settings.camera_file or root / "calib.json")

@@ -33,6 +33,7 @@ DepthLoader: TypeAlias = Callable[[int], Depth]
 # ------------------------------------------------------------------------------------------
 # Files of frames
 
+LEAVE_OUT = "leave the frame out by dataset.start, dataset.stop or dataset.stride"
 _NAMED_IN_NOTES = 5
 
 
@@ -191,10 +192,7 @@ def readable(
 def require_folder(path: Path, what: str) -> None:
     """Raises DatasetError unless the folder exists."""
     if not path.is_dir():
-        raise DatasetError(
-            f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
-            "recording is: --set dataset.path=FOLDER (fgslam data: where to get some)"
-        )
+        raise DatasetError(f"{what} {path} does not exist; check dataset.path and dataset.kind")
 
 
 # ------------------------------------------------------------------------------------------
@@ -240,7 +238,7 @@ def without_unknown(depth: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _bytes_of(path: Path) -> bytes:
-    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
+    remedy = f"restore the file, or {LEAVE_OUT}"
     if path.exists() and not path.is_file():
         require_file(path, FrameError, remedy)  # reading a pipe waits, a device may have no end
     try:

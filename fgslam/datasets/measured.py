@@ -32,7 +32,6 @@ from fgslam.core.log import (
 )
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry, measurement_map
 from fgslam.core.types import Trajectory
-from fgslam.datasets.images import require_folder
 from fgslam.datasets.recording import select_frames
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
@@ -65,7 +64,6 @@ def open_measurement_files(
             "dataset.start and dataset.stride"
         )
     root = Path(settings.path)
-    require_folder(root, "the recording")
     path, truth, landmarks = (
         root / name for name in (LOG_FILE, GROUND_TRUTH_FILE, LANDMARK_TRUTH_FILE)
     )

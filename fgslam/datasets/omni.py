@@ -185,7 +185,6 @@ def open_pictures(settings: PanoramasSettings | OmniPathSettings) -> OmniRecordi
         FrameError: the first picture cannot be read.
     """
     root = Path(settings.path)
-    require_folder(root, "the folder of pictures")
     table, inner, listed, width = root / POSES_FILE, root / _PICTURES, None, None
     if isinstance(settings, OmniPathSettings):
         paths = pictures_in(root, settings.pattern)

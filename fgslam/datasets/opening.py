@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -22,6 +23,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import body_is_camera
 from fgslam.datasets.images import Depth, DepthLoader, readable
+from fgslam.datasets.layouts import files_of
 from fgslam.datasets.ledger import DEPTH, LENGTH, LENS, ODOMETRY, Entry
 from fgslam.datasets.recording import MOUNTING, Recording
 from fgslam.datasets.settings import (
@@ -58,6 +60,18 @@ READERS: Mapping[str, Callable[[], Any]] = {
 """By kind of the settings what opens a recording."""
 
 
+def _reader(settings: Any) -> Callable[..., Any]:
+    """What opens the recording. Raises DatasetError unless it is there; a simulation always is."""
+    if (path := getattr(settings, "path", None)) and not any(
+        map(Path.exists, files_of(Path(path)))
+    ):
+        raise DatasetError(
+            f"the recording {path} does not exist; say where it is: --set dataset.path=PATH "
+            "(fgslam data: where to get some)"
+        )
+    return READERS[settings.kind]()
+
+
 def open_recording(
     settings: FileRecordingSettings, odometry: RecordedOdometrySettings | None = None
 ) -> Recording:
@@ -71,7 +85,7 @@ def open_recording(
         DatasetError: the recording is missing, malformed or empty.
         CalibrationError: its calibration is missing or impossible.
     """
-    read, odometry = READERS[settings.kind](), odometry or RecordedOdometrySettings()
+    read, odometry = _reader(settings), odometry or RecordedOdometrySettings()
     found: Recording = read(settings, odometry)
     known = None if found.rectifier is None else found.rectifier.calibration
     if known is not None and known.guessed_lens:
@@ -199,7 +213,7 @@ def open_measurements(
         DatasetError: the recording is missing, malformed or empty.
         ConfigError: a simulated drive cannot be driven, or synthetic odometry is asked for.
     """
-    found: MeasurementRecording = READERS[settings.kind]()(
+    found: MeasurementRecording = _reader(settings)(
         settings, odometry or RecordedOdometrySettings(), seed
     )
     return found
@@ -212,7 +226,7 @@ def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
         DatasetError: it is missing, malformed or empty; of these CalibrationError, where the
             camera is concerned, and FrameError, where the first picture cannot be read.
     """
-    found: OmniRecording = READERS[settings.kind]()(settings)
+    found: OmniRecording = _reader(settings)(settings)
     return found
 
 

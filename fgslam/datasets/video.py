@@ -25,7 +25,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OutputError
 from fgslam.core.files import remove_left_behind, replacing
 from fgslam.core.sides import differ_in_number
-from fgslam.datasets.images import both_views, require_size
+from fgslam.datasets.images import LEAVE_OUT, both_views, require_size
 from fgslam.datasets.layouts import films_in
 from fgslam.datasets.ledger import IMAGES, PAIRING, TIMES, Entry
 from fgslam.datasets.recording import (
@@ -358,7 +358,7 @@ class VideoFrames:
             if not self._capture.grab():
                 raise FrameError(
                     f"video {self._path} ends after {self._next} frames, frame {index} of "
-                    f"{self.count} is missing: it is truncated; restore it, or set dataset.stop"
+                    f"{self.count} is missing: it is truncated; restore it, or {LEAVE_OUT}"
                 )
             self._next += 1
             if index - self._next >= _KEPT:
@@ -371,15 +371,10 @@ class VideoFrames:
                     self._kept.popitem(last=False)
             elif self._next > index:
                 raise FrameError(
-                    f"video {self._path}: frame {index} cannot be decoded; leave it out with "
-                    "dataset.start, stop or stride"
+                    f"video {self._path}: frame {index} cannot be decoded; {LEAVE_OUT}"
                 )
 
     def _open(self) -> cv2.VideoCapture:
-        if not self._path.is_file():
-            raise DatasetError(
-                f"video {self._path} does not exist; say where it is: --set dataset.path=FILE"
-            )
         capture = cv2.VideoCapture(str(self._path))
         if not capture.isOpened():
             raise DatasetError(

@@ -14,7 +14,7 @@ class Advice(NamedTuple):
         make: what makes the input in a folder, and gives what a command is given.
         message: pattern of the message; its groups are what it advises.
         follow: words added to the command: its groups, `{}` for the folder.
-        mend: what the advice changes in the folder, if anything.
+        mend: what the advice changes in the folder, if anything; a path is given from then on.
         command: words before what is given, and behind.
         drop: words of the command that the advice takes away.
     """

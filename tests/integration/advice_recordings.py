@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -80,8 +81,8 @@ def without(name: str) -> Callable[[Path], object]:
     return lambda root: (root / name).unlink()
 
 
-def opencv(root: Path, **changes: Any) -> Path:
-    matrix = [[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]]
+def opencv(root: Path, focal: float = 30.0, **changes: Any) -> Path:
+    matrix = [[focal, 0.0, 15.5], [0.0, focal, 11.5], [0.0, 0.0, 1.0]]
     values: dict[str, Any] = {"R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0], **changes}
     values |= {f"{n}{k}": matrix for k in (1, 2) for n in "K"}
     values |= {f"D{k}": [0.01, 0.01, 0.0, 0.0] for k in (1, 2)}
@@ -325,6 +326,119 @@ def wide(root: Path) -> Path:
     return root
 
 
+def written_anew(root: Path) -> Path:
+    """A calibration as the advice writes it, next to what is not read."""
+    return opencv(root, image_size=[WIDTH, HEIGHT])
+
+
+def unread(name: str) -> Callable[[Path], Path]:
+    return lambda root: (root / name, (root / name).write_bytes(b"\0 \1"))[0]
+
+
+def of_colmap(root: Path, ending: str = "txt") -> Path:
+    """Two cameras of COLMAP, whose places are not stated."""
+    line = f"PINHOLE {WIDTH} {HEIGHT} 30 30 15.5 11.5"
+    (root / "cameras.txt").write_text(f"1 {line}\n2 {line}\n", encoding="utf-8")
+    return root / "cameras.txt"
+
+
+def rigs_of_colmap(root: Path) -> Path:
+    text = "1 2 CAMERA 1 CAMERA 2 1 1 0 0 0 -0.2 0 0\n"
+    (root / "rigs.txt").write_text(text, encoding="utf-8")
+    return of_colmap(root)
+
+
+def turned_apart(root: Path) -> Path:
+    """Cameras that look 40 degrees apart, with 18 degrees of view each."""
+    turn = Rotation.from_euler("y", 40.0, degrees=True).as_matrix()
+    apart = (-turn @ APART[:3, 3]).tolist()
+    return opencv(root, 100.0, R=turn.tolist(), T=apart, image_size=[WIDTH, HEIGHT])
+
+
+def too_near(root: Path) -> Path:
+    return opencv(root, T=[-0.0002, 0.0, 0.0], image_size=[WIDTH, HEIGHT])
+
+
+def topics_of_four(root: Path, apart: float = 0.2) -> Path:
+    """A bag of two pairs, and a calibration that names the topics of all four cameras."""
+    write_chain(root, 4, (30.0,))
+    values = yaml.safe_load((root / "camchain.yaml").read_text(encoding="utf-8"))
+    names = ("/cam/left", "/cam/right", "/rear/left", "/rear/right")
+    for each, topic in zip(values.values(), names, strict=True):
+        each["rostopic"] = f"{topic}/image_raw"
+    if apart != 0.2:  # the second pair stands above the first one, and looks back
+        step = np.array(values["cam2"]["T_cn_cnm1"])
+        step[:3, :3] = np.diag([-1.0, 1.0, -1.0])
+        step[1, 3] = apart
+        values["cam2"]["T_cn_cnm1"] = step.tolist()
+    (root / "camchain.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return bag(root, stereo() + stereo(names=("/rear/left", "/rear/right")))
+
+
+def five_terms(root: Path) -> Path:
+    """A fisheye's camera_info with a fifth term that is not 0."""
+    odd = {"distortion_model": "equidistant", "d": np.full(5, 0.01)}
+    made = [
+        (topic, stamp, kind, {**fields, **odd} if topic.endswith("camera_info") else fields)
+        for topic, stamp, kind, fields in stereo()
+    ]
+    return bag(root, made)
+
+
+def one_sample(root: Path) -> Path:
+    image_folder(root)
+    (root / "odom.csv").write_text("0.1,1.0,0.0\n", encoding="utf-8")
+    return root
+
+
+def unreadable(root: Path) -> Path:
+    image = next(iter(sorted((image_folder(root) / "left").iterdir())))
+    image.unlink()
+    image.mkdir()
+    return root
+
+
+def film(path: Path, seed: int, rate: float = 10.0, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    """Motion JPEG, five frames."""
+    made = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size)
+    for k in range(5):
+        made.write(np.dstack([picture(seed + k, *size)] * 3))
+    made.release()
+    return path
+
+
+def films(*names: str) -> Callable[[Path], Path]:
+    def make(root: Path) -> Path:
+        for name in names:
+            film(root / f"{name}.avi", 60 if name == "left" else 10)
+        write_calibration(root)
+        return root
+
+    return make
+
+
+def three_cameras(root: Path) -> None:
+    write_calibration(root, vertical_baseline_m=0.2)
+
+
+def films_of(name: str, *names: str) -> Callable[[Path], Path]:
+    """An experiment on films in a folder of that name; those named are in the folder `here`."""
+
+    def make(root: Path) -> Path:
+        (root / "here").mkdir()
+        films(*names)(root / "here")
+        values = {"name": "x", "dataset": {"kind": "video", "path": str(root / name)}}
+        (root / "x.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+        return root / "x.yaml"
+
+    return make
+
+
+def name_sides(root: Path) -> None:
+    (root / "here" / "a.avi").rename(root / "here" / "left.avi")
+    (root / "here" / "b.avi").rename(root / "here" / "right.avi")
+
+
 CONVERT = ("camera convert", "{}/out.yaml")
 TO_ROS = ("camera convert", "{}/ros")
 OF_RECORDINGS = {
@@ -517,6 +631,62 @@ OF_RECORDINGS = {
     ),
     "the right camera first": Advice(
         right_one_first, r"choose them in that order: (--cameras 1,0)", r"\1", command=TO_ROS
+    ),
+    "a calibration of MATLAB": Advice(
+        unread("x.mat"), r"write by jsonencode a .json of M1, D1, M2, D2, R, T and image_size",
+        mend=written_anew, command=("camera show", ""),
+    ),
+    "a calibration of COLMAP in bytes": Advice(
+        unread("cameras.bin"), r"write COLMAP's as text: colmap model_converter",
+        mend=rigs_of_colmap, command=("camera show", ""),
+    ),
+    "cameras of COLMAP without a rig": Advice(
+        of_colmap, r"put the rigs.txt of COLMAP 3.12 or later next to it", mend=rigs_of_colmap,
+        command=("camera show", ""),
+    ),
+    "cameras that share no view": Advice(
+        turned_apart, r"choose a view: .*(--fov)", r"\1 120", command=("camera show", ""),
+    ),
+    "cameras at one place": Advice(
+        too_near, r"the unit of its lengths \((--unit)\)", r"\1 1000", command=("camera show", ""),
+    ),
+    "topics of four cameras": Advice(
+        topics_of_four, r"say which two or three form the rig: (--topics)",
+        r"\1 /cam/left/image_raw,/cam/right/image_raw",
+        command=("inspect", "--camera {}/camchain.yaml"),
+    ),
+    "a malformed camera_info": Advice(
+        five_terms, r"equidistant takes 4 .* give the calibration by (--camera) FILE",
+        r"\1 {}/calib.json",
+    ),
+    "odometry of one sample": Advice(
+        one_sample, r"another odometry.kind \((\w+), synthetic", r"--set odometry.kind=\1",
+        command=("run", "--out {}/out"),
+    ),
+    "an image that cannot be read": Advice(
+        unreadable, r"leave the frame out with (dataset.start)", r"--set \1=1",
+    ),
+    "no layout of that kind": Advice(
+        kitti_drive, r"check dataset.path, and (dataset.kind) where", r"--set \1=kitti",
+        command=("inspect", "--set dataset.kind=image_folder"),
+        drop="--set dataset.kind=image_folder",
+    ),
+    "no drive of KITTI raw": Advice(
+        lambda root: (image_folder(root / "x"), raw_drive(root))[1],
+        r"holds no drive of KITTI raw; check (dataset.path)",
+        r"--camera {0}/../its.json --set \1={0}",
+        command=("inspect", "--set dataset.kind=kitti_raw --set dataset.path={}/x"),
+        drop="--set dataset.path={}/x",
+    ),
+    "films without sides": Advice(
+        films_of("here", "a", "b"), r"by their names \(left.mp4 and right.mp4,", mend=name_sides,
+    ),
+    "three films and two cameras": Advice(
+        films("left", "right", "top"), r"give one of all three, (--camera) FILE",
+        r"\1 {}/calib.json", three_cameras,
+    ),
+    "films that moved": Advice(
+        films_of("gone", "left", "right"), r"say where it is: (--set dataset.path)=FILE", r"\1={}/here",
     ),
     "poses without covariances": Advice(
         with_truth, r"states no covariances; give them by (--covariance) FILE",

@@ -304,7 +304,7 @@ def test_no_odometry_and_no_truth(own_recording: Path, refusal: Refusal) -> None
 
 def test_no_such_folder(tmp_path: Path, refusal: Refusal) -> None:
     line = refusal(experiment(tmp_path / "absent"))
-    assert f"{tmp_path / 'absent'} does not exist; check dataset.path" in line
+    assert f"{tmp_path / 'absent'} does not exist; say where it is: --set dataset.path=" in line
 
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -334,8 +334,7 @@ def test_experiments_say_clearly_that_their_data_is_absent(
     (line,) = capfd.readouterr().err.splitlines()
     assert status == 2
     assert str(absent) in line
-    assert "does not exist; check dataset.path" in line
-    assert "is: --set dataset.path=F" in line  # FOLDER or FILE
+    assert "does not exist; say where it is: --set dataset.path=" in line
 
 
 def test_ranges_that_leave_nothing(recording: Path, refusal: Refusal) -> None:

@@ -358,7 +358,7 @@ def test_frames_without_those_before_them_are_refused(
 
 
 def test_an_absent_folder_a_damaged_and_an_empty_log_are_refused(folder: Path) -> None:
-    with pytest.raises(DatasetError, match=r"does not exist; check dataset\.path"):
+    with pytest.raises(DatasetError, match=r"does not exist; say where it is"):
         open_measurements(settings(folder / "absent"), 0)
     log = MeasurementLog.load(folder / "measurements.npz")
     (folder / "measurements.npz").write_bytes(b"no log")
