@@ -772,7 +772,8 @@ def _view(
         notes = (
             *notes,
             f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-            f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg, --fov of fgslam camera, is another angle)",
+            f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg, or --fov of fgslam "
+            "camera, chooses another angle)",
         )
     return view, notes
 

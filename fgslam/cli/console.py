@@ -104,7 +104,8 @@ def _files(result: RunResult) -> Iterator[tuple[str, str]]:
     if (result.folder / REPORT_FILE).is_file():
         yield "report", f"{result.folder / REPORT_FILE}  (open it in a browser)"
     if result.status == "finished" and (result.folder / LOG_FILE).is_file():
-        for k, command in enumerate(next_commands(result.folder)):
+        images = not getattr(result.config, "on_measurements", False)
+        for k, command in enumerate(next_commands(result.folder, images)):
             yield "" if k else "next", command
 
 

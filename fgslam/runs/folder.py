@@ -298,11 +298,15 @@ def _version(package: str) -> str | None:
 # What one may do with a run
 
 
-def next_commands(folder: Path | str) -> tuple[str, ...]:
-    """Commands that take the run of SLAM in ``folder`` further, as they are typed."""
+def next_commands(folder: Path | str, images: bool) -> tuple[str, ...]:
+    """Commands that take the run of SLAM in ``folder`` further, of images or of measurements."""
     run = shlex.quote(str(folder))
+    compare = f"fgslam compare {run} --estimators landmark_kalman,isam2,batch"
+    export = f"fgslam export {run} --map map.ply"
+    if not images:
+        return compare, export
     return (
-        f"fgslam compare {run} --estimators landmark_kalman,isam2,batch",
-        f"fgslam export {run} --map map.ply --colour --dense cloud.ply --grid map.yaml",
+        compare,
+        f"{export} --colour --dense cloud.ply --grid map.yaml",
         f"fgslam film {run} run.mp4",
     )

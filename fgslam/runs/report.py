@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import yaml
@@ -30,6 +30,7 @@ from fgslam.core.types import (
 )
 from fgslam.core.yaml_text import plain_values
 from fgslam.datasets.ledger import Entry, of_values, rests_on_guess
+from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import (
     Answer,
     JudgedClosure,
@@ -396,6 +397,8 @@ def load_report(folder: Path, run: Path | None = None, whole: bool = False) -> R
             f"{folder}: is a homing run ({config['task']}), and this needs one of SLAM; open its "
             "report.html, or give it to `fgslam compare`"
         )
+    blind = {each.kind for each in get_args(MeasurementDatasetSettings)}
+    images = _section(config, "dataset").get("kind") not in blind
     truth = None if (file := find("ground_truth.tum")) is None else Trajectory.load(file)
     titles = marked(
         metrics["estimators"], SYNTHETIC if metrics.get("remark") else "", say_failed=False
@@ -455,7 +458,7 @@ def load_report(folder: Path, run: Path | None = None, whole: bool = False) -> R
             for path in (pictures.glob(f"{VIEW}_*.jpg") if whole else ())
         },
         about=tuple((one.title, _kind_in_words(one.kind)) for one in estimators),
-        commands=next_commands(folder.resolve().name) if find(LOG_FILE) else (),
+        commands=next_commands(folder.resolve().name, images) if find(LOG_FILE) else (),
     )
 
 
