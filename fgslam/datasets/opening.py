@@ -69,7 +69,8 @@ def _reader(settings: Any) -> Callable[..., Any]:
             f"the recording {path} does not exist; say where it is: --set dataset.path=PATH "
             "(fgslam data: where to get some)"
         )
-    return READERS[settings.kind]()
+    read: Callable[..., Any] = READERS[settings.kind]()
+    return read
 
 
 def open_recording(
