@@ -20,7 +20,7 @@ from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import ConfigError, FgslamError, one_line
 from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import find_experiment, list_experiments
-from fgslam.runs.wanted import Wanted
+from fgslam.runs.wanted import Filmed, Wanted
 
 if TYPE_CHECKING:
     from fgslam.runs.config import Experiment
@@ -529,8 +529,7 @@ def pictures(run_folder: options.RunFolder) -> None:
 def film(
     run_folder: options.RunFolder,
     out: Annotated[Path, typer.Argument()],
-    estimator: str | None = None,
-    taught: Path | None = None,
+    shown: Filmed,
     speed: Annotated[float, typer.Option(min=0.01, max=1000.0)] = 1.0,
     width: Annotated[int, typer.Option(min=320, max=3840)] = 1280,
     overwrite: bool = False,
@@ -543,9 +542,7 @@ def film(
     Args:
         run_folder (RUN): a run folder
         out (FILE): the film, .mp4 or .gif
-        estimator: whose path and map; default the one that steered
-        taught (DIR): of a route that was followed: the run folder of fgslam teach (its --report),
-            for the pictures of path images
+        shown: what it shows
         speed (FACTOR): over the recording's
         width (PIXELS): of its frames
         overwrite: replace an earlier one
@@ -554,7 +551,7 @@ def film(
     from fgslam.runs.view import film_of_run
 
     with progress_bar() as progress:
-        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite, speed, width)
+        line = film_of_run(run_folder, out, shown, progress, overwrite, speed, width)
     typer.echo(line)
 
 

@@ -608,12 +608,10 @@ class FileKind(Generic[T]):
                 return {name: file[name] for name in file.files}
         except UNREADABLE as error:
             cause = " ".join(str(error).split()) or type(error).__name__
+            name, mend = self.name.removeprefix("fgslam "), f"it may be truncated, {self.again}"
             if "pickle" in cause:  # NumPy advises to unpickle, which would run what the file holds
-                cause = "neither arrays nor an archive of them"
-            raise self.error(
-                f"{path}: not a readable {self.name.removeprefix('fgslam ')} ({cause}); it may be "
-                f"truncated, {self.again}"
-            ) from None
+                cause, mend = "neither arrays nor an archive of them", self.give
+            raise self.error(f"{path}: not a readable {name} ({cause}); {mend}") from None
 
 
 _OF_RUNS = FileKind(

@@ -66,8 +66,8 @@ def _reader(settings: Any) -> Callable[..., Any]:
         map(Path.exists, files_of(Path(path)))
     ):
         raise DatasetError(
-            f"the recording {path} does not exist; say where it is: --set dataset.path=PATH "
-            "(fgslam data: where to get some)"
+            f"the recording {path} does not exist; say where it is: --set dataset.path=PATH, for "
+            "export and film --recording PATH (fgslam data: where to get some)"
         )
     read: Callable[..., Any] = READERS[settings.kind]()
     return read

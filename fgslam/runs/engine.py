@@ -336,10 +336,16 @@ def is_finished(folder: Path) -> bool:
 
 
 def require_same(config: Experiment, folder: Path) -> None:
-    """A run resumes only with the configuration that it was started with."""
+    """A run resumes only with the configuration that it was started with.
+
+    Where its recording lies may differ: that it is the same one is seen by its contents.
+    """
     path = folder / RUN_MARKER
     before = load_experiment(path)
-    if before.as_values() != config.as_values():
+    then, now = before.as_values(), config.as_values()
+    if isinstance(now.get("dataset", {}).get("path"), str):
+        then.get("dataset", {})["path"] = now["dataset"]["path"]
+    if then != now:
         compared = "run" in (before.provenance or {})  # not begun by `fgslam run`
         command = "" if compared else f" ({resume_command(folder)})"
         raise ConfigError(

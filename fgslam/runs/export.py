@@ -33,7 +33,6 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.types import NO_LANDMARKS, Estimate, Trajectory, read_covariances
 from fgslam.datasets.images import Depth, encoded_png
-from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.content import read_metrics
@@ -151,8 +150,12 @@ def export_run(
 
 def config_of(run: Path, recording: Path | None) -> ExperimentConfig:
     """A run's configuration, its recording where it is now. Raises FgslamError."""
-    moved = [] if recording is None else [f"dataset.path={json.dumps(str(recording.resolve()))}"]
-    return load_config(run / RUN_MARKER, moved)
+    return load_config(run / RUN_MARKER, moved_to(recording))
+
+
+def moved_to(recording: Path | None) -> list[str]:
+    """The override that states where a run's recording is now; none where it was."""
+    return [] if recording is None else [f"dataset.path={json.dumps(str(recording.resolve()))}"]
 
 
 def dense_map(
@@ -511,13 +514,8 @@ def frames_of(
         raise DatasetError(f"a recording of kind {dataset.kind} has no images to export")
     if isinstance(dataset, RenderedLabSettings):
         sequence: ImageSequence = open_sequence(config)
-    elif is_recording(Path(dataset.path)):
-        sequence = open_recording(dataset)
     else:
-        raise DatasetError(
-            f"{dataset.path}: the run's recording is not there any more; say where it is now: "
-            "--recording PATH"
-        )
+        sequence = open_recording(dataset)
     name = dataset.path if hasattr(dataset, "path") else dataset.kind
     rows = rows_along(trajectory, sequence.timestamps, f"the recording {name}")
     return rows, *readers_of(sequence)

@@ -50,16 +50,24 @@ from fgslam.runs.config import (
     FollowConfig,
     TeachConfig,
     as_task,
-    load_config,
     load_experiment,
 )
-from fgslam.runs.export import frames_of, log_of, results_folder, rows_of_frames, sources_of
+from fgslam.runs.export import (
+    config_of,
+    frames_of,
+    log_of,
+    moved_to,
+    results_folder,
+    rows_of_frames,
+    sources_of,
+)
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.report import load_report
 from fgslam.runs.tasks.routes import FOLLOW_FILE, ROUTE_FILE, recording_along
 from fgslam.runs.tasks.slam import Watch
 from fgslam.runs.tasks.slam_results import RunOutputs
 from fgslam.runs.units import Progress
+from fgslam.runs.wanted import Filmed
 from fgslam.slam.pipeline import FrameReport
 
 _MOST_FPS = 30.0
@@ -68,8 +76,7 @@ _MOST_FPS = 30.0
 def film_of_run(
     run: Path,
     out: Path,
-    estimator: str | None,
-    taught: Path | None,
+    shown: Filmed,
     progress: Progress,
     overwrite: bool = False,
     speed: float = 1.0,
@@ -83,8 +90,7 @@ def film_of_run(
     Args:
         run: what ``fgslam run`` or ``fgslam follow`` wrote.
         out: the file, .mp4 or .gif.
-        estimator: whose path and map; None for the one that steered.
-        taught: what ``fgslam teach`` wrote, for the pictures of path images; None: their features.
+        shown: whose path and map, or which pictures.
         progress: called with what is done, how far, of how much.
         overwrite: replace a file that is there.
         speed: of the film over the recording's.
@@ -94,9 +100,13 @@ def film_of_run(
         FgslamError: no run of cameras there, its recording is gone, or the film cannot be written.
     """
     require_film_suffix(out)
-    require_output(out, overwrite, (*sources_of(run), *([] if taught is None else [taught])))
-    if is_run_folder(run) and isinstance(config := load_experiment(run / RUN_MARKER), FollowConfig):
-        if estimator is not None:
+    taught, given = shown.taught, [path for path in (shown.taught, shown.recording) if path]
+    require_output(out, overwrite, (*sources_of(run), *given))
+    config = (
+        load_experiment(run / RUN_MARKER, moved_to(shown.recording)) if is_run_folder(run) else None
+    )
+    if isinstance(config, FollowConfig):
+        if shown.estimator is not None:
             raise ConfigError(
                 f"{run}: a route was followed, without estimators; leave out --estimator"
             )
@@ -104,7 +114,7 @@ def film_of_run(
     else:
         if taught is not None:
             raise ConfigError(f"{run}: no route was followed there; leave out --taught")
-        what, (times, frames) = "poses", _film_of_slam(run, estimator)
+        what, (times, frames) = "poses", _film_of_slam(run, shown)
     fps = speed / median_step(times, what, run)
     step = math.ceil(fps / _MOST_FPS)
 
@@ -146,12 +156,12 @@ def _readable(read: Callable[[int], Any], number: int) -> Any:
 # SLAM as a film: images with matches next to the growing map
 
 
-def _film_of_slam(run: Path, estimator: str | None) -> tuple[FloatArray, Iterator[Image]]:
+def _film_of_slam(run: Path, shown: Filmed) -> tuple[FloatArray, Iterator[Image]]:
     """Path and landmarks are those known at the end; a landmark appears when first seen."""
-    folder = run / results_folder(run, estimator)
+    folder = run / results_folder(run, shown.estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
     log, data = MeasurementLog.load(log_of(run)), load_report(run)
-    frame_at, pictures, _ = frames_of(load_config(run / RUN_MARKER), trajectory)
+    frame_at, pictures, _ = frames_of(config_of(run, shown.recording), trajectory)
     plane = level_axes(data.up)[:2]
     above = points.positions @ plane.T
     truth = None if data.truth is None else data.truth.poses[:, :3, 3] @ plane.T

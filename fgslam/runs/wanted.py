@@ -1,4 +1,4 @@
-"""What `fgslam export` is asked for; light, as every command loads it before it does anything."""
+"""What `export` and `film` are asked for; light: every command loads it before it does anything."""
 
 from __future__ import annotations
 
@@ -87,3 +87,19 @@ class Wanted:
     def chosen_axes(self) -> Literal["camera", "ros"]:
         """Of trajectory and map, which lie in one world."""
         return self.axes or ("ros" if self.is_bag else "camera")
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """What a film of a run shows.
+
+    Attributes:
+        estimator: whose path and map; default the one that steered
+        taught (DIR): of a route that was followed: the run folder of fgslam teach (its --report),
+            for the pictures of path images
+        recording: where the run's recording is now; default where it was, or next to the run
+    """
+
+    estimator: str | None = None
+    taught: Path | None = None
+    recording: Path | None = None

@@ -398,7 +398,9 @@ def unreadable(root: Path) -> Path:
     return root
 
 
-def film(path: Path, seed: int, rate: float = 10.0, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+def film(
+    path: Path, seed: int, rate: float = 10.0, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> Path:
     """Motion JPEG, five frames."""
     made = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size)
     for k in range(5):
@@ -614,7 +616,7 @@ OF_RECORDINGS = {
         command=("inspect", "--set 3"), drop="--set 3"
     ),
     "a recording that moved": Advice(
-        absent_recording, r"where the recording is: (--set dataset.path)=FOLDER", r"\1={}/here"
+        absent_recording, r"say where it is: (--set dataset.path)=PATH", r"\1={}/here"
     ),
     "an output that exists": Advice(
         converted, r"choose another name, or add (--overwrite)", r"\1", command=CONVERT
@@ -686,7 +688,8 @@ OF_RECORDINGS = {
         r"\1 {}/calib.json", three_cameras,
     ),
     "films that moved": Advice(
-        films_of("gone", "left", "right"), r"say where it is: (--set dataset.path)=FILE", r"\1={}/here",
+        films_of("gone", "left", "right"), r"say where it is: (--set dataset.path)=PATH",
+        r"\1={}/here",
     ),
     "poses without covariances": Advice(
         with_truth, r"states no covariances; give them by (--covariance) FILE",

@@ -9,19 +9,23 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from advice import Advice
 from advice_recordings import covariances_of, poses_file, with_truth
 from dataset_builders import image_folder
-from running import stop_after
+from running import ROOT, main, stop_after
 
+from fgslam.core.log import MeasurementLog
 from fgslam.runs.config import make_config
+from fgslam.runs.folder import Owner
 from fgslam.runs.run import run_experiment
 
 SIMULATED: dict[str, Any] = {
     "name": "x",
     "dataset": {"kind": "simulated_measurements", "stop": 4},
     "estimator": {"kind": "landmark_kalman"},
+    "output": {"pictures": False, "report": False},
 }
 ROOM = TemporaryDirectory(prefix="fgslam_advice_")
 MADE: dict[str, Path] = {}
@@ -153,6 +157,86 @@ def without_covariances(root: Path) -> Path:
 def two_estimates(root: Path) -> Path:
     poses_file(root, "other.tum", covariances=True)
     return with_truth(root, covariances=True)
+
+
+def of_images(**changes: Any) -> Callable[[Path], Path]:
+    """An experiment on six small images."""
+
+    def make(root: Path) -> Path:
+        dataset = {"kind": "image_folder", "path": str(image_folder(root / "images"))}
+        return experiment(root, dataset=dataset, **changes)
+
+    return make
+
+
+def sweep_of_others(root: Path) -> Path:
+    (root / "s").mkdir()
+    (root / "s" / "sweep.yaml").write_text("experiments: {y: {}}\n", encoding="utf-8")
+    return experiment(root)
+
+
+def homing(root: Path) -> Path:
+    return Path(shutil.copy(ROOT / "experiments" / "homing_panoramas.yaml", root / "x.yaml"))
+
+
+def shorter_log(root: Path) -> Path:
+    """The log of an interrupted run without its last frame."""
+    given = interrupted(root)
+    whole = MeasurementLog.load(root / "o" / "measurements.npz")
+    log = MeasurementLog(whole.rig, whole.motion_model)
+    for increment in list(whole)[:-1]:
+        log.append(increment)
+    log.save(root / "o" / "measurements.npz")
+    return given
+
+
+def of_sides(root: Path) -> Path:
+    """The same trajectory of a run as that of both cameras."""
+    run_folder(root)
+    for side in ("left", "right"):
+        exported(root, side)
+    upper = np.tile(np.eye(6)[np.triu_indices(6)] * 1e-4, (SIMULATED["dataset"]["stop"], 1))
+    np.savetxt(root / "covariances.txt", upper)
+    return root / "left.tum"
+
+
+def exported(root: Path, side: str) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        given = root / "o", "--frame", side, "--trajectory", root / f"{side}.tum", "--overwrite"
+        assert main(patch, "export", *given) == 0
+    return root / f"{side}.tum"
+
+
+def moved_images(root: Path) -> Path:
+    interrupted(root)
+    path = root / "o" / "config.yaml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace(str(MADE["interrupted"].parent / "images"), "/gone"), "utf-8")
+    return root / "o"
+
+
+def images_of(root: Path) -> None:
+    (root / "moved").symlink_to(MADE["interrupted"].parent / "images")
+
+
+def read_only(root: Path) -> Path:
+    root = image_folder(root / "images")
+    root.chmod(0o555)
+    return root
+
+
+OWNERS: list[Owner] = []
+
+
+def written_by_another(root: Path) -> Path:
+    (root / "o").mkdir()
+    OWNERS.append(Owner(root / "o"))
+    OWNERS[-1].take()
+    return experiment(root)
+
+
+def drives(**drive: Any) -> Callable[[Path], Path]:
+    return simulated(stop=None, drive=drive)
 
 
 RUN = ("run", "--out {}/o")
@@ -334,6 +418,93 @@ OF_RUNS = {
         r"--metric \1 --out {}/t",
         command=("sweep", "--jobs 1 --set seed=1 --out {}/s --metric nosuch"),
         drop="--out {}/s --metric nosuch",
+    ),
+    "no odometry": Advice(
+        of_images(), r"has no odometry; set (odometry.kind) to (\w+)", r"--set \1=\2", command=RUN,
+    ),
+    "a sweep of other experiments": Advice(
+        sweep_of_others, r"resume with the same experiments, or choose another (--out)",
+        command=("sweep", "--jobs 1 --set seed=1 --out {}/s --resume"), drop="--out {}/s --resume",
+        follow=r"\1 {}/t",
+    ),
+    "a sweep that saves a map": Advice(
+        of_images(odometry={"kind": "constant_velocity"}, map={"save": "m.fgmap"}),
+        r"leave it out, or (--set map.save=null)", r"\1",
+        command=("sweep", "--jobs 1 --set seed=1 --out {}/s"),
+    ),
+    "trials of another task": Advice(
+        homing, r"(--trials) needs an experiment of SLAM", mend=experiment,
+        command=("compare", "--trials 2 --out {}/c"),
+    ),
+    "trials of a recording": Advice(
+        of_images(), r"(--trials) needs a rendered_lab or simulated_measurements", mend=experiment,
+        command=("compare", "--trials 2 --out {}/c"),
+    ),
+    "no images to inspect": Advice(
+        experiment, r"holds measurements, no images; choose a recording of images",
+        mend=lambda root: image_folder(root / "images"),
+    ),
+    "poses of another camera than the truth": Advice(
+        of_sides, r"give both of one frame: fgslam export RUN --trajectory FILE (--frame) left",
+        mend=lambda root: exported(root, "right"),
+        command=("judge", "--covariance {}/covariances.txt --truth {}/right.tum"),
+    ),
+    "a log that is shorter than its state": Advice(
+        shorter_log, r"restore it, or start again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "a film of a route": Advice(
+        lambda root: (interrupted(root), root / "o")[1], r"no route was followed there; leave out",
+        command=("film", "{}/a.mp4 --taught {}/o"), drop="--taught {}/o",
+    ),
+    "images that moved": Advice(
+        moved_images, r"for export and film (--recording) PATH", r"\1 {}/moved", images_of,
+        command=("export", "--map {}/a.ply --colour"),
+    ),
+    "images of a film that moved": Advice(
+        moved_images, r"for export and film (--recording) PATH", r"\1 {}/moved", images_of,
+        command=("film", "{}/a.mp4"),
+    ),
+    "images that moved before a run goes on": Advice(
+        lambda root: moved_images(root) / "config.yaml", r"is: (--set dataset.path)=PATH",
+        r"\1={}/moved", images_of, command=("run", "--out {}/o --resume"),
+    ),
+    "a memory beside a calibration that is read-only": Advice(
+        read_only, r"is read-only; (--rig-memory) FILE keeps it elsewhere",
+        r"\1 {0}/memory.npz --out {0}/n",
+        command=RUN, drop="--out {}/o",
+    ),
+    "a memory that is none": Advice(
+        lambda root: image_folder(root / "images"), r"give a file that fgslam run --rig-memory wro",
+        command=("run", "--out {}/o --rig-memory {}/images/calib.json"),
+        drop="--rig-memory {}/images/calib.json",
+    ),
+    "a run that another process writes": Advice(
+        written_by_another, r"wait for it to end, or choose another (--out)", r"\1 {}/n",
+        lambda root: OWNERS.pop().__exit__(None, None, None), command=RUN, drop="--out {}/o",
+    ),
+    "waypoints at one place": Advice(
+        drives(path="waypoints", waypoints_m=[[0, 0]]),
+        r"add points to (dataset.drive.waypoints_m)", r"--set \1=[[-1,0],[1,0.2]]", command=RUN,
+    ),
+    "waypoints too sharp": Advice(
+        drives(path="waypoints", waypoints_m=[[-1, 0], [1, 0], [-1, 0.01]]),
+        r"(dataset.drive.waypoints_m) turn back .* add points that lead around the turn",
+        r"--set \1=[[-1,0],[0.5,-0.5],[1,0],[0.5,0.5],[-1,0.5]]", command=RUN,
+    ),
+    "too few frames of a drive": Advice(
+        drives(frames=3), r"(dataset.drive.frames) is 3, .* takes at least (\d+) frames",
+        r"--set \1=\2", command=RUN,
+    ),
+    "bursts of frames": Advice(
+        drives(path="random_poses", frames=3, random_poses={"burst": 2}),
+        r"(dataset.drive.frames) is 3, no multiple of random_poses.burst 2", r"--set \1=4",
+        command=RUN,
+    ),
+    "a burst with no room": Advice(
+        drives(path="random_poses", frames=100, random_poses={"burst": 100}),
+        r"room for (dataset.drive.random_poses.burst) 100 .*; lower it", r"--set \1=2",
+        command=RUN,
     ),
     "covariances of one of two": Advice(
         two_estimates, r"judge them one by one",
