@@ -160,7 +160,7 @@ def _run_folder_or_experiment(given: str) -> Path:
 
 def saved_map(given: str) -> Path:
     """An existing file. Raises DatasetError."""
-    path, remedy = Path(given), "save a map with fgslam run --map-out"
+    path, remedy = Path(given), "give a file that fgslam run --map-out wrote"
     if not path.exists():
         raise DatasetError(f"{path}: no such file; {remedy}")
     require_file(path, DatasetError, remedy)

@@ -17,6 +17,7 @@ class Advice(NamedTuple):
         mend: what the advice changes in the folder, if anything; a path is given from then on.
         command: words before what is given, and behind.
         drop: words of the command that the advice takes away.
+        slow: it takes more than a second.
     """
 
     make: Callable[[Path], Path]
@@ -25,3 +26,4 @@ class Advice(NamedTuple):
     mend: Callable[[Path], object] = lambda root: None
     command: tuple[str, str] = ("inspect", "")
     drop: str = ""
+    slow: bool = False

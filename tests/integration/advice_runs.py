@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 import yaml
 from advice import Advice
 from advice_recordings import covariances_of, poses_file, with_truth
-from dataset_builders import image_folder
+from dataset_builders import image_folder, picture, save
+from recordings import BASELINE, FOCAL, write_recording
 from running import ROOT, main, stop_after
 
 from fgslam.core.log import MeasurementLog
@@ -235,10 +237,59 @@ def written_by_another(root: Path) -> Path:
     return experiment(root)
 
 
-def drives(**drive: Any) -> Callable[[Path], Path]:
-    return simulated(stop=None, drive=drive)
+def boards(root: Path) -> Path:
+    """A recording in which something can be seen, and in `m.fgmap` its map."""
+    if "boards" not in MADE:
+        MADE["boards"] = write_recording(Path(ROOM.name) / "boards", frames=6, top=False)
+        mapped(MADE["boards"], Path(ROOM.name) / "boards_run")
+    shutil.copytree(Path(ROOM.name) / "boards_run", root / "r")
+    (root / "r" / "m.fgmap").rename(root / "m.fgmap")
+    return Path(shutil.copytree(MADE["boards"], root / "boards"))
 
 
+def mapped(recording: Path, run: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        assert (
+            main(patch, "run", recording, "--out", run, "--map-out", run / "m.fgmap", *QUIET) == 0
+        )
+
+
+def run_of_boards(root: Path) -> Path:
+    return (boards(root), root / "r")[1]
+
+
+def map_of_boards(root: Path) -> Path:
+    return (boards(root), root / "m.fgmap")[1]
+
+
+def unstated_lens(root: Path) -> Path:
+    """Four coefficients of nothing beside their matrices."""
+    boards(root)
+    width, height = 160, 120
+    matrix = [[FOCAL, 0.0, (width - 1) / 2], [0.0, FOCAL, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    values = {
+        f"{n}{k}": matrix if n == "K" else [0.02, 0.0, 0.0, 0.0] for n in "KD" for k in (1, 2)
+    }
+    values |= {"R": np.eye(3).tolist(), "T": [-BASELINE, 0.0, 0.0], "image_size": [width, height]}
+    (root / "boards" / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+    return root / "boards"
+
+
+def elsewhere(recording: Path) -> Path:
+    """The same cameras where nothing is as it was."""
+    for k, image in enumerate(sorted(recording.glob("*/*.png"))):
+        save(image, picture(10 + k, 160, 120))
+    return recording
+
+
+def rendered(**changes: Any) -> Callable[[Path], Path]:
+    drive = {"path": "waypoints", "waypoints_m": [[-3, -2], [-2, -2.1]], "frames": None}
+    dataset = {"kind": "rendered_lab", "stop": 2} | changes
+    dataset["drive"] = drive | changes.get("drive", {})
+    return lambda root: experiment(root, dataset=dataset)
+
+
+QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
 RUN = ("run", "--out {}/o")
 OF_RUNS = {
     "two ways with what exists": Advice(
@@ -483,28 +534,126 @@ OF_RUNS = {
         written_by_another, r"wait for it to end, or choose another (--out)", r"\1 {}/n",
         lambda root: OWNERS.pop().__exit__(None, None, None), command=RUN, drop="--out {}/o",
     ),
-    "waypoints at one place": Advice(
-        drives(path="waypoints", waypoints_m=[[0, 0]]),
-        r"add points to (dataset.drive.waypoints_m)", r"--set \1=[[-1,0],[1,0.2]]", command=RUN,
-    ),
-    "waypoints too sharp": Advice(
-        drives(path="waypoints", waypoints_m=[[-1, 0], [1, 0], [-1, 0.01]]),
-        r"(dataset.drive.waypoints_m) turn back .* add points that lead around the turn",
-        r"--set \1=[[-1,0],[0.5,-0.5],[1,0],[0.5,0.5],[-1,0.5]]", command=RUN,
-    ),
     "too few frames of a drive": Advice(
-        drives(frames=3), r"(dataset.drive.frames) is 3, .* takes at least (\d+) frames",
+        simulated(stop=None, drive={"frames": 3}),
+        r"(dataset.drive.frames) is 3, .* takes at least (\d+) frames",
         r"--set \1=\2", command=RUN,
     ),
+    "no map to begin in": Advice(
+        boards, r"no such file; give a file that fgslam run --map-out wrote",
+        mend=lambda root: mapped(root / "boards", root / "s"),
+        command=("run", "--out {}/o --map-in {}/s/m.fgmap"), slow=True,
+    ),
+    "a map that is none": Advice(
+        boards, r"give a file that fgslam run --map-out wrote", r"--map-in {}/m.fgmap",
+        command=("run", "--out {}/o --map-in {}/boards/calib.json"),
+        drop="--map-in {}/boards/calib.json", slow=True,
+    ),
+    "a map that is kept and saved": Advice(
+        boards, r"there is no new map to save; leave map.save out",
+        command=("run", "--out {}/o --map-in {}/m.fgmap --set map.extend=false "
+                 "--estimator landmark_kalman --map-out {}/n.fgmap"),
+        drop="--map-out {}/n.fgmap", slow=True,
+    ),
+    "a map onto itself": Advice(
+        boards, r"are one file; save to another name", r"--map-out {}/n.fgmap",
+        command=("run", "--out {}/o --map-in {}/m.fgmap --map-out {}/m.fgmap"),
+        drop="--map-out {}/m.fgmap", slow=True,
+    ),
+    "two maps to begin in": Advice(
+        boards, r"map.load and map.made_from exclude each other; give one of them",
+        command=("run", "--out {}/o --map-in {}/m.fgmap --set map.made_from.dataset.path={}/x "
+                 "--set map.made_from.dataset.kind=image_folder"),
+        drop="--set map.made_from.dataset.path={}/x --set map.made_from.dataset.kind=image_folder",
+        slow=True,
+    ),
+    "a map that cannot be left as it is": Advice(
+        boards, r"use (\w+) or ekf, or map.extend true", r"--estimator \1",
+        command=("run", "--out {}/o --map-in {}/m.fgmap --set map.extend=false"), slow=True,
+    ),
+    "another place than the map's": Advice(
+        lambda root: elsewhere(boards(root)), r"raise map.begin.within, or tell .* by (map.start)",
+        r"--set \1=last", command=("run", "--out {}/o --map-in {}/m.fgmap"), slow=True,
+    ),
+    "a frame that is not selected": Advice(
+        map_of_boards, r"not among the frames selected .*; choose another, or other (--start)",
+        r"\1 1", command=("localize", "{}/boards --frame 1 --start 3 --out {}/l"),
+        drop="--start 3", slow=True,
+    ),
+    "too few frames for a submap": Advice(
+        map_of_boards, r"too few frames before it for a submap of 3; lower (--frames)", r"\1 2",
+        command=("localize", "{}/boards --frame 1 --frames 3 --out {}/l"), drop="--frames 3",
+        slow=True,
+    ),
+    "colours of a map": Advice(
+        map_of_boards, r"give (--map) or --trajectory, or a run folder", r"\1 {}/a.ply",
+        command=("export", "--map {}/a.ply --colour"), drop="--map {}/a.ply --colour", slow=True,
+    ),
+    "three cameras of two": Advice(
+        run_of_boards, r"--cameras 3: the rig has 2; leave it out",
+        command=("export", "--dense {}/a.ply --cameras 3"), drop="--cameras 3", slow=True,
+    ),
+    "voxels that are too fine": Advice(
+        run_of_boards, r"use (--voxel [\d.e-]+), or leave it out", r"\1",
+        command=("export", "--dense {}/a.ply --voxel 0.0001"), drop="--voxel 0.0001", slow=True,
+    ),
+    "a dense map of nothing certain": Advice(
+        run_of_boards, r"use a larger (--sigma) \(([\d.e-]+)\)", r"\1 \2",
+        command=("export", "--dense {}/a.ply --sigma 0.00001"), drop="--sigma 0.00001", slow=True,
+    ),
+    "near things": Advice(
+        boards, r"(frontend.stereo.max_disparity_px) = 4 and are lost; raise it to (\d+)",
+        r"--set \1=\2", command=("inspect", "--set frontend.stereo.max_disparity_px=4"), slow=True,
+    ),
+    "a lens that is not stated": Advice(
+        unstated_lens, r"\((dataset.lens=\w+) states otherwise\)", r"--set \1", slow=True,
+    ),
+    "synthetic odometry of the lab": Advice(
+        rendered(), r"(odometry.kind) synthetic is for recordings; .*: choose (\w+)",
+        r"--set \1=\2", command=("run", "--out {}/o --set odometry.kind=synthetic"), slow=True,
+    ),
+    "noise of the lab's odometry": Advice(
+        rendered(), r"set the noise of its wheels under (dataset.odometry)", r"--set \1.noise=2",
+        command=("run", "--out {}/o --set odometry.kind=recorded "
+                 "--set odometry.speed_sigma_mps=0.2"),
+        drop="--set odometry.speed_sigma_mps=0.2", slow=True,
+    ),
+    "a visit that a place has not": Advice(
+        rendered(place="corridors", visit=2), r"(dataset.visit) 2: .* corridors has (\d)",
+        r"--set \1=\2", command=RUN, slow=True,
+    ),
+    "posters that a place has not": Advice(
+        rendered(place="corridors"), r"means nothing in (dataset.place) .* hang in the (lab)",
+        r"--set \1=\2", command=("run", "--out {}/o --set dataset.posters=identical"), slow=True,
+    ),
+    "a drive that a place has not": Advice(
+        rendered(drive={"path": "one_way"}), r"(dataset.drive.path) one_way .* choose one of (\w+)",
+        r"--set \1=\2", command=RUN, slow=True,
+    ),
+    "waypoints at one place": Advice(
+        rendered(drive={"waypoints_m": [[0, 0]]}),
+        r"add points to (dataset.drive.waypoints_m)", r"--set \1=[[-3,-2],[-2,-2.1]]", command=RUN,
+        slow=True,
+    ),
+    "waypoints too sharp": Advice(
+        rendered(drive={"waypoints_m": [[-1, 0], [1, 0], [-1, 0.01]]}),
+        r"(dataset.drive.waypoints_m) turn back .* add points that lead around the turn",
+        r"--set \1=[[-1,0],[0.5,-0.5],[1,0],[0.5,0.5],[-1,0.5]]", command=RUN, slow=True,
+    ),
+    "waypoints in a wall": Advice(
+        rendered(drive={"waypoints_m": [[-1, 0], [-20, 0]]}),
+        r"move the points of (dataset.drive.waypoints_m)", r"--set \1=[[-3,-2],[-2,-2.1]]",
+        command=RUN, slow=True,
+    ),
     "bursts of frames": Advice(
-        drives(path="random_poses", frames=3, random_poses={"burst": 2}),
+        rendered(drive={"path": "random_poses", "frames": 3, "random_poses": {"burst": 2}}),
         r"(dataset.drive.frames) is 3, no multiple of random_poses.burst 2", r"--set \1=4",
-        command=RUN,
+        command=RUN, slow=True,
     ),
     "a burst with no room": Advice(
-        drives(path="random_poses", frames=100, random_poses={"burst": 100}),
+        rendered(drive={"path": "random_poses", "random_poses": {"burst": 100}}),
         r"room for (dataset.drive.random_poses.burst) 100 .*; lower it", r"--set \1=2",
-        command=RUN,
+        command=RUN, slow=True,
     ),
     "covariances of one of two": Advice(
         two_estimates, r"judge them one by one",

@@ -17,7 +17,9 @@ SAID: dict[str, str] = {}
 """What commands reported before and after their advice was followed, by name."""
 
 
-@pytest.mark.parametrize("name", ADVICE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * a.slow) for n, a in ADVICE.items()]
+)
 def test_advice_works_when_it_is_followed(
     tmp_path: Path, capfd: Capture, monkeypatch: Patch, name: str
 ) -> None:
@@ -91,9 +93,10 @@ def test_messages_that_name_an_option_are_provoked_more_and_more(
     rooms: tuple[str, ...], most: int
 ) -> None:
     """At most so many are not in the table above: a number that is only to become less."""
-    if SAID.keys() != ADVICE.keys():
+    wanted = {name for name, advice in ADVICE.items() if rooms == ("",) or not advice.slow}
+    if not wanted <= SAID.keys():
         pytest.skip("needs all that was said above")
-    said = "\n".join(SAID.values())
+    said = "\n".join(SAID[name] for name in wanted)
     known = {k: v for room in rooms for k, v in messages(ROOT / "fgslam" / room).items()}
     missing = [place for place, text in known.items() if not re.search(text, said)]
     assert len(missing) <= most, "\n".join([f"{len(missing)} of {len(known)}", *missing])

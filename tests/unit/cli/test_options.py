@@ -26,7 +26,9 @@ def test_a_pipe_or_a_folder_in_the_place_of_a_map_is_called_one(tmp_path: Path) 
     pipe = tmp_path / "pipe.fgmap"
     os.mkfifo(pipe)
     for path, what in ((pipe, "it is a pipe"), (tmp_path, "it is a folder")):
-        with pytest.raises(DatasetError, match=f"{what}; save a map with fgslam run --map-out"):
+        with pytest.raises(
+            DatasetError, match=f"{what}; give a file that fgslam run --map-out wrote"
+        ):
             saved_map(str(path))
     with pytest.raises(DatasetError, match="no such file"):
         saved_map(str(tmp_path / "absent.fgmap"))
