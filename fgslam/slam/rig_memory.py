@@ -172,7 +172,7 @@ _FILE = FileKind(
     "fgslam rig memory",
     version=1,
     error=CalibrationError,
-    give="give a file that fgslam run --rig-memory wrote",
+    give="give another FILE by --rig-memory, or move this one away",
     again="move it away: the next drive begins another one",
     check=_require_memory,
 )

@@ -81,8 +81,8 @@ def without(name: str) -> Callable[[Path], object]:
     return lambda root: (root / name).unlink()
 
 
-def opencv(root: Path, focal: float = 30.0, **changes: Any) -> Path:
-    matrix = [[focal, 0.0, 15.5], [0.0, focal, 11.5], [0.0, 0.0, 1.0]]
+def opencv(root: Path, **changes: Any) -> Path:
+    matrix = [[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]]
     values: dict[str, Any] = {"R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0], **changes}
     values |= {f"{n}{k}": matrix for k in (1, 2) for n in "K"}
     values |= {f"D{k}": [0.01, 0.01, 0.0, 0.0] for k in (1, 2)}
@@ -331,6 +331,10 @@ def written_anew(root: Path) -> Path:
     return opencv(root, image_size=[WIDTH, HEIGHT])
 
 
+def stated_lens(root: Path) -> Path:
+    return opencv(root, image_size=[WIDTH, HEIGHT], distortion_model="radtan")
+
+
 def unread(name: str) -> Callable[[Path], Path]:
     return lambda root: (root / name, (root / name).write_bytes(b"\0 \1"))[0]
 
@@ -346,13 +350,6 @@ def rigs_of_colmap(root: Path) -> Path:
     text = "1 2 CAMERA 1 CAMERA 2 1 1 0 0 0 -0.2 0 0\n"
     (root / "rigs.txt").write_text(text, encoding="utf-8")
     return of_colmap(root)
-
-
-def turned_apart(root: Path) -> Path:
-    """Cameras that look 40 degrees apart, with 18 degrees of view each."""
-    turn = Rotation.from_euler("y", 40.0, degrees=True).as_matrix()
-    apart = (-turn @ APART[:3, 3]).tolist()
-    return opencv(root, 100.0, R=turn.tolist(), T=apart, image_size=[WIDTH, HEIGHT])
 
 
 def too_near(root: Path) -> Path:
@@ -495,13 +492,17 @@ OF_RECORDINGS = {
         raw_drive, r"of that date, or give one by (--camera) FILE", r"\1 {}/../its.json"
     ),
     "a view that is cut off": Advice(
-        wide, r"beyond is cut off \((dataset.fov_deg) chooses another angle\)", r"--set \1=165"
+        wide, r"beyond is cut off \((dataset.fov_deg), or --fov", r"--set \1=165"
     ),
     "a format that no ending names": Advice(
         converted, r"no format ends like that; known: (\.json) \(fgslam\)", r"{}/other\1",
         command=("camera convert", "{}/out.abc"), drop="{}/out.abc"
     ),
     "lens of four coefficients": Advice(guessed_lens, r"say (--set dataset.lens=\w+)", r"\1"),
+    "lens of four coefficients in a file": Advice(
+        written_anew, r"write distortion_model: radtan there, or say", mend=stated_lens,
+        command=("camera show", ""),
+    ),
     "baseline in millimetres": Advice(
         lambda root: pairs(root, baseline_m=200.0), r"give it: (--unit 0.001) for", r"\1"
     ),
@@ -646,9 +647,6 @@ OF_RECORDINGS = {
         of_colmap, r"put the rigs.txt of COLMAP 3.12 or later next to it", mend=rigs_of_colmap,
         command=("camera show", ""),
     ),
-    "cameras that share no view": Advice(
-        turned_apart, r"choose a view: .*(--fov)", r"\1 120", command=("camera show", ""),
-    ),
     "cameras at one place": Advice(
         too_near, r"the unit of its lengths \((--unit)\)", r"\1 1000", command=("camera show", ""),
     ),
@@ -666,7 +664,7 @@ OF_RECORDINGS = {
         command=("run", "--out {}/out"),
     ),
     "an image that cannot be read": Advice(
-        unreadable, r"leave the frame out with (dataset.start)", r"--set \1=1",
+        unreadable, r"leave the frame out by (dataset.start)", r"--set \1=1",
     ),
     "no layout of that kind": Advice(
         kitti_drive, r"check dataset.path, and (dataset.kind) where", r"--set \1=kitti",

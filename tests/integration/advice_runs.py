@@ -294,7 +294,7 @@ RUN = ("run", "--out {}/o")
 OF_RUNS = {
     "two ways with what exists": Advice(
         with_run, r"--overwrite and (--resume) exclude each other; give one",
-        command=("run", "--out {}/o --overwrite --resume"), drop="--resume",
+        command=("run", "--out {}/o --overwrite --resume"), drop="--resume", slow=True,
     ),
     "results that exist": Advice(with_run, r"or add (--overwrite) or --resume", r"\1", command=RUN),
     "nothing to resume": Advice(
@@ -353,7 +353,7 @@ OF_RUNS = {
     ),
     "no frame of a drive": Advice(
         simulated(stop=None, start=999), r"lower (dataset.start) or raise", r"--set \1=60",
-        command=RUN,
+        command=RUN, slow=True,
     ),
     "a path that a place has not": Advice(
         simulated(world={"place": "corridor"}), r"choose one of (\w+), or another dataset.world",
@@ -378,10 +378,10 @@ OF_RUNS = {
     ),
     "trials of two runs": Advice(
         twice, r"(--trials) takes one run or experiment at a time; give one",
-        command=("compare", "{}/p/o --trials 2 --out {}/c"), drop="{}/p/o",
+        command=("compare", "{}/p/o --trials 2 --out {}/c"), drop="{}/p/o", slow=True,
     ),
     "trials of a file": Advice(
-        experiment, r"or add (--trials) N", r"\1 2 --out {}/c", command=("compare", ""),
+        experiment, r"or add (--trials) N", r"\1 2 --out {}/c", command=("compare", ""), slow=True,
     ),
     "no such estimator": Advice(
         run_folder, r"give (--estimators) with some of (\w+)", r"\1 \2",
@@ -417,7 +417,7 @@ OF_RUNS = {
     "dead reckoning of no odometry": Advice(
         without_odometry, r"--estimators odometry: .* leave it out", "--estimators landmark_kalman",
         command=("compare", "--estimators odometry,landmark_kalman"),
-        drop="--estimators odometry,landmark_kalman",
+        drop="--estimators odometry,landmark_kalman", slow=True,
     ),
     "a filter of a pose graph": Advice(
         graph_file, r"give (--estimators) (\S+)", r"\1 \2",
@@ -485,11 +485,11 @@ OF_RUNS = {
     ),
     "trials of another task": Advice(
         homing, r"(--trials) needs an experiment of SLAM", mend=experiment,
-        command=("compare", "--trials 2 --out {}/c"),
+        command=("compare", "--trials 2 --out {}/c"), slow=True,
     ),
     "trials of a recording": Advice(
         of_images(), r"(--trials) needs a rendered_lab or simulated_measurements", mend=experiment,
-        command=("compare", "--trials 2 --out {}/c"),
+        command=("compare", "--trials 2 --out {}/c"), slow=True,
     ),
     "no images to inspect": Advice(
         experiment, r"holds measurements, no images; choose a recording of images",
@@ -523,10 +523,11 @@ OF_RUNS = {
     "a memory beside a calibration that is read-only": Advice(
         read_only, r"is read-only; (--rig-memory) FILE keeps it elsewhere",
         r"\1 {0}/memory.npz --out {0}/n",
-        command=RUN, drop="--out {}/o",
+        command=RUN, drop="--out {}/o", slow=True,
     ),
     "a memory that is none": Advice(
-        lambda root: image_folder(root / "images"), r"give a file that fgslam run --rig-memory wro",
+        lambda root: image_folder(root / "images"), r"give another FILE by (--rig-memory)",
+        r"\1 {}/n.npz",
         command=("run", "--out {}/o --rig-memory {}/images/calib.json"),
         drop="--rig-memory {}/images/calib.json",
     ),
@@ -619,7 +620,8 @@ OF_RUNS = {
         drop="--set odometry.speed_sigma_mps=0.2", slow=True,
     ),
     "a visit that a place has not": Advice(
-        rendered(place="corridors", visit=2), r"(dataset.visit) 2: .* corridors has (\d)",
+        rendered(place="corridors", visit=2, drive={"path": "one_way"}),
+        r"(dataset.visit) 2: .* corridors has (\d)",
         r"--set \1=\2", command=RUN, slow=True,
     ),
     "posters that a place has not": Advice(
