@@ -422,7 +422,7 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
     it early with the table so far; the same command with --resume does what is missing.
 
     Args:
-        experiments (RECORDING|EXPERIMENT...): experiments, .yaml or names, and recordings' folders
+        experiments (RECORDING|EXPERIMENT...): experiments, .yaml or names, and recordings
         axes (--set A.B=VALUES): values of one key, with commas, or FIRST:END[:STEP] without END;
             every combination of several is a case. estimators.NAME.KEY is of one estimator
         estimators (A,B,C): kinds, or labels of the configuration; default those of the

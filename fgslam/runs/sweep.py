@@ -29,11 +29,12 @@ import yaml
 
 from fgslam.backend.settings import EstimatorSettings, family_of
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import ConfigError, FgslamError, OutputError
+from fgslam.core.errors import CalibrationError, ConfigError, DatasetError, FgslamError, OutputError
 from fgslam.core.files import clear_output_errors, write_text
 from fgslam.core.log import MeasurementLog
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.yaml_text import plain_values
+from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.settings import SimulatedMeasurementsSettings
 from fgslam.evaluation.judging import (
     SIGNIFICANT,
@@ -144,7 +145,7 @@ class Axis(NamedTuple):
 
 
 def read_source(path: Path) -> Source:
-    """An experiment's file, the name of a shipped one, or a recording's folder.
+    """An experiment's file, the name of a shipped one, or a recording.
 
     Raises:
         FgslamError: it is none of these, or cannot be used.
@@ -152,7 +153,11 @@ def read_source(path: Path) -> Source:
     found = find_experiment(path)
     if not found.exists():
         raise ConfigError(f"{found}: no such file or folder; {suggestion(found)}")
-    values = bare_experiment(found).values if found.is_dir() else read_mapping(found)
+    try:
+        values = bare_experiment(found).values if is_recording(found) else read_mapping(found)
+    except (DatasetError, CalibrationError) as error:  # advises options that a sweep has not
+        stated = f"fgslam init {found} with those options > x.yaml, and sweep x.yaml"
+        raise type(error)(f"{error}; a sweep takes them from a file: {stated}") from None
     return Source(make_experiment(values, str(found)).name, _resolve_paths(values), str(found))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -17,8 +18,11 @@ from advice_recordings import covariances_of, poses_file, with_truth
 from dataset_builders import image_folder, picture, save
 from recordings import BASELINE, FOCAL, write_recording
 from running import ROOT, main, stop_after
+from textured_room import SMALL_CAMERA_FILE, folder_of
 
 from fgslam.core.log import MeasurementLog
+from fgslam.homing.route import PathMemory
+from fgslam.runs.bare import short_config
 from fgslam.runs.config import make_config
 from fgslam.runs.folder import Owner
 from fgslam.runs.run import run_experiment
@@ -287,6 +291,64 @@ def rendered(**changes: Any) -> Callable[[Path], Path]:
     dataset = {"kind": "rendered_lab", "stop": 2} | changes
     dataset["drive"] = drive | changes.get("drive", {})
     return lambda root: experiment(root, dataset=dataset)
+
+
+def unstated_options(root: Path) -> Path:
+    """A recording whose calibration lies elsewhere."""
+    images = image_folder(root / "images")
+    (images / "calib.json").rename(root / "mine.json")
+    return images
+
+
+def stated_options(root: Path) -> Path:
+    text = short_config(root / "images", root / "mine.json")
+    (root / "x.yaml").write_text(text, encoding="utf-8")
+    return root / "x.yaml"
+
+
+def taught(root: Path) -> Path:
+    """A route of three views, and in `t` the run that taught it; gives the folder of views."""
+    if "taught" not in MADE:
+        room = Path(ROOM.name) / "routes"
+        room.mkdir()
+        folder_of(room / "drive", np.arange(0.0, 1.2, 0.4))
+        (room / "camera.yaml").write_text(SMALL_CAMERA_FILE, encoding="utf-8")
+        given = "--camera", room / "camera.yaml", "--out", room / "r.fgpath", "--report", room / "t"
+        with pytest.MonkeyPatch.context() as patch:
+            assert main(patch, "teach", room / "drive", *given) == 0
+        MADE["taught"] = room
+    shutil.copytree(MADE["taught"], root, dirs_exist_ok=True)
+    return root / "drive"
+
+
+def route_of(root: Path) -> Path:
+    taught(root)
+    PathMemory.of(PathMemory.load(root / "r.fgpath").images).save(root / "r.fgpath")
+    return root / "r.fgpath"
+
+
+def larger_views(root: Path) -> Path:
+    for path in sorted(taught(root).glob("*.png")):
+        save(path, cv2.resize(cv2.imread(str(path)), (602, 182)))
+    text = SMALL_CAMERA_FILE.replace("301", "602").replace("91", "182")
+    (root / "other.yaml").write_text(text, encoding="utf-8")
+    return root / "r.fgpath"
+
+
+def round_pictures(root: Path) -> Path:
+    taught(root)
+    for k in range(3):
+        shown = cv2.circle(np.zeros((91, 301), np.uint8), (150, 45), 45, 255, -1)
+        save(root / "photos" / f"{k}.png", np.dstack([picture(10 + k, 301, 91) & shown] * 3))
+    return root / "photos"
+
+
+def followed(root: Path) -> Path:
+    taught(root)
+    with pytest.MonkeyPatch.context() as patch:
+        given = "follow", root / "r.fgpath", root / "drive", "--out", root / "f"
+        assert main(patch, *given) == 0
+    return root / "f"
 
 
 QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
@@ -656,6 +718,36 @@ OF_RUNS = {
         rendered(drive={"path": "random_poses", "random_poses": {"burst": 100}}),
         r"room for (dataset.drive.random_poses.burst) 100 .*; lower it", r"--set \1=2",
         command=RUN, slow=True,
+    ),
+    "a sweep of a recording with options": Advice(
+        unstated_options, r"fgslam init \S+ with those options > x.yaml, and sweep x.yaml",
+        mend=stated_options, command=("sweep", "--jobs 1 --set seed=1 --out {}/s"),
+    ),
+    "a route without a camera": Advice(
+        taught, r"no camera is given; add (--camera) FILE", r"\1 {}/camera.yaml",
+        command=("teach", "--out {}/n.fgpath --report {}/n"), slow=True,
+    ),
+    "a route that holds no camera": Advice(
+        route_of, r"give the recording's own, (--camera) FILE",
+        r"\1 {}/camera.yaml", command=("follow", "{}/drive --out {}/f"), slow=True,
+    ),
+    "a route of another size": Advice(
+        larger_views, r"give their own camera, (--camera) FILE", r"\1 {}/other.yaml",
+        command=("follow", "{}/drive --out {}/f"), slow=True,
+    ),
+    "an estimator of a route": Advice(
+        followed, r"without estimators; leave out --estimator",
+        command=("film", "{}/a.mp4 --estimator ekf"), drop="--estimator ekf", slow=True,
+    ),
+    "a folder that taught nothing": Advice(
+        followed, r"not a folder that fgslam teach wrote; give its --report", "--taught {}/t",
+        command=("film", "{}/a.mp4 --taught {}/drive"), drop="--taught {}/drive", slow=True,
+    ),
+    "pictures that are no panoramas": Advice(
+        round_pictures, r"the camera that took them, (--camera) FILE",
+        r"\1 {}/camera.yaml",
+        command=("teach", "--camera equirectangular --out {}/n.fgpath --report {}/n"),
+        drop="--camera equirectangular", slow=True,
     ),
     "covariances of one of two": Advice(
         two_estimates, r"judge them one by one",

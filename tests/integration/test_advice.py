@@ -30,6 +30,7 @@ def test_advice_works_when_it_is_followed(
     before, behind = (part.replace("{}", str(root)) for part in advice.command)
 
     def told(*words: object) -> tuple[int, str]:
+        capfd.readouterr()  # of what made or mended the input
         with units_in_this_process():
             code = main(monkeypatch, *words)
         said = capfd.readouterr()
