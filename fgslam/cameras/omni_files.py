@@ -34,6 +34,7 @@ from fgslam.cameras.settings import (
     OmniCameraKind,
     PlacedMirrorSettings,
     RadialPolynomialSettings,
+    VerticalSettings,
 )
 from fgslam.cameras.trees import flat_numbers, read_tree
 from fgslam.core.errors import CalibrationError, shortened
@@ -118,10 +119,8 @@ def make_camera(
             return HyperbolicMirror.with_view(frame, settings.xi, view, *given)
         case OCamCalibSettings():
             raw, ring = _ocamcalib(_find(settings.file, folder), image_size)
-            ring, ahead = settings.ring_px or ring, math.radians(settings.ahead_deg)
-            return LensCamera.of(raw, ring, False, ahead, settings.clockwise)
+            return _vertical(raw, settings, ring)
         case LensSettings():
-            ahead, up = math.radians(settings.ahead_deg), settings.middle == "up"
             path = _find(settings.file, folder)
             raw, *others = read_calibration_file(path).cameras
             if others:
@@ -134,7 +133,7 @@ def make_camera(
                     f"{path} calibrates pictures of {raw.width}x{raw.height}, but the pictures "
                     f"have {image_size[0]}x{image_size[1]} pixels; scale them, or calibrate again"
                 )
-            return LensCamera.of(raw, settings.ring_px, up, ahead, settings.clockwise)
+            return _vertical(raw, settings)
         case RadialPolynomialSettings():
             size = _stated_size(settings.kind, settings.size, image_size)
             frame = _frame(settings, size)
@@ -194,6 +193,13 @@ _KINDS: dict[str, type[OmniCameraKind]] = {kind.kind: kind for kind in get_args(
 def _frame(mirror: PlacedMirrorSettings, size: Size) -> MirrorFrame:
     centre = mirror.centre or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
     return MirrorFrame(*size, centre, math.radians(mirror.ahead_deg), mirror.clockwise)
+
+
+def _vertical(
+    raw: RawCamera, settings: VerticalSettings, ring: tuple[float, float] | None = None
+) -> LensCamera:
+    ahead, up = math.radians(settings.ahead_deg), settings.middle == "up"
+    return LensCamera.of(raw, settings.ring_px or ring, up, ahead, settings.clockwise)
 
 
 def _ocamcalib(path: Path, size: Size | None) -> tuple[RawCamera, tuple[float, float] | None]:

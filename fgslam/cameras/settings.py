@@ -83,7 +83,16 @@ class HyperbolicMirrorSettings(PlacedMirrorSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class OCamCalibSettings(MirrorMountSettings):
+class VerticalSettings(MirrorMountSettings):
+    """How a camera hangs or stands whose axis is vertical."""
+
+    middle: Literal["down", "up"] = Field(
+        default="down", description="where its middle points: up as of a fisheye that points up"
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class OCamCalibSettings(VerticalSettings):
     """A camera calibrated with OCamCalib."""
 
     kind: Literal["ocamcalib"] = "ocamcalib"
@@ -91,14 +100,11 @@ class OCamCalibSettings(MirrorMountSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class LensSettings(MirrorMountSettings):
+class LensSettings(VerticalSettings):
     """A camera of camodocal (MEI, KANNALA_BRANDT) or of Kalibr whose axis is vertical."""
 
     kind: Literal["lens"] = "lens"
     file: File = Field(default="camera.yaml", description="next to the pictures, else here")
-    middle: Literal["down", "up"] = Field(
-        default="down", description="where its middle points: up as of a fisheye that points up"
-    )
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -365,10 +365,10 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
     if isinstance(camera, LensCamera):
         middle, other = ("up", "down") if camera.up else ("down", "up")
         turn = "clockwise" if camera.clockwise else "counter-clockwise"
+        opposite = "false" if camera.clockwise else "true"
         assumed = (
-            f"the picture's middle is taken to look {middle}, bearings to grow {turn} in it; "
-            f"dataset.camera.kind=lens, dataset.camera.middle={other} and dataset.camera.clockwise "
-            "say otherwise",
+            f"the picture's middle is taken to look {middle}, bearings to grow {turn} in it (--set "
+            f"dataset.camera.middle={other}, --set dataset.camera.clockwise={opposite} otherwise)",
         )
         hole, rim = camera.ring
         # A mirror reflects its camera in the middle; a lens has no rim that must be in the picture.

@@ -337,6 +337,7 @@ def larger_views(root: Path) -> Path:
 
 def round_pictures(root: Path) -> Path:
     taught(root)
+    (root / "mirror.yaml").write_text("kind: mirror\nring_px: [10, 44]\n", encoding="utf-8")
     for k in range(3):
         shown = cv2.circle(np.zeros((91, 301), np.uint8), (150, 45), 45, 255, -1)
         save(root / "photos" / f"{k}.png", np.dstack([picture(10 + k, 301, 91) & shown] * 3))
@@ -745,7 +746,7 @@ OF_RUNS = {
     ),
     "pictures that are no panoramas": Advice(
         round_pictures, r"the camera that took them, (--camera) FILE",
-        r"\1 {}/camera.yaml",
+        r"\1 {}/mirror.yaml",
         command=("teach", "--camera equirectangular --out {}/n.fgpath --report {}/n"),
         drop="--camera equirectangular", slow=True,
     ),
