@@ -389,7 +389,7 @@ def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
     return (
         f"pictures of {camera.width}x{camera.height} pixels over 360 x {view:g} degrees have "
         f"{across:.1f} columns but {down:.1f} rows a degree: are they whole panoramas? Else give "
-        "dataset.camera.top_elevation_deg and bottom_elevation_deg",
+        "dataset.camera.top_elevation_deg and dataset.camera.bottom_elevation_deg",
     )
 
 

@@ -455,7 +455,7 @@ def looks_ahead(body: str) -> Entry:
         ODOMETRY,
         "its frame is of the robot's body",
         f"nothing states where the camera sits on {body}: it is taken to look straight ahead from "
-        "there (dataset.camera_yaw_deg and lever_arm_m say otherwise)",
+        "there (dataset.camera_yaw_deg and dataset.lever_arm_m say otherwise)",
         MOUNTING,
         guessed=True,
     )

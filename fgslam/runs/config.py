@@ -218,7 +218,8 @@ def _describe(model: type[BaseModel], errors: list[ErrorDetails], where: str) ->
     if first["type"] in _UNKNOWN:
         known = sorted(_known_keys(model, first["loc"][:-1]))
         close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
+        meant = [".".join([*keys[:-1], *close])] if close else _within(model, key)
+        hint = f"did you mean {meant[0]}?" if meant else f"known here: {', '.join(known)}"
         return f"{where}: unknown key {key}; {hint}{more}"
     if first["type"] in ("missing", "missing_argument"):
         return f"{where}: key {key} is missing; add it{more}"
@@ -235,6 +236,12 @@ def _describe(model: type[BaseModel], errors: list[ErrorDetails], where: str) ->
 
 def _known_keys(model: type[BaseModel], place: Sequence[str | int]) -> set[str]:
     return {key for group in _followed(model, place)[1] for key in _fields(group)}
+
+
+def _within(model: type, key: str) -> list[str]:
+    """The key as it stands in groups of the model."""
+    groups = ((name, group) for name, kind in _fields(model).items() for group in _groups(kind))
+    return [f"{name}.{key}" for name, group in groups if key in _fields(group)]
 
 
 def _followed(model: type, place: Sequence[str | int]) -> tuple[list[str], list[type]]:

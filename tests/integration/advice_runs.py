@@ -728,6 +728,11 @@ OF_RUNS = {
         taught, r"no camera is given; add (--camera) FILE", r"\1 {}/camera.yaml",
         command=("teach", "--out {}/n.fgpath --report {}/n"), slow=True,
     ),
+    "panoramas that are cropped": Advice(
+        taught, r"give (dataset.camera.top_\S+) and (dataset.camera.bottom_\S+)",
+        r"--set \1=54 --set \2=-54 --overwrite",
+        command=("teach", "--camera equirectangular --out {}/n.fgpath --report {}/n"), slow=True,
+    ),
     "a route that holds no camera": Advice(
         route_of, r"give the recording's own, (--camera) FILE",
         r"\1 {}/camera.yaml", command=("follow", "{}/drive --out {}/f"), slow=True,

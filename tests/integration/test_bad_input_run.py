@@ -345,7 +345,7 @@ def test_ranges_that_leave_nothing(recording: Path, refusal: Refusal) -> None:
 
 def test_an_unknown_key(recording: Path, refusal: Refusal) -> None:
     line = refusal(experiment(recording), "--set", "frontend.sift.max_feature=3")
-    assert "unknown key frontend.sift.max_feature; did you mean max_features?" in line
+    assert "unknown key frontend.sift.max_feature; did you mean frontend.sift.max_features?" in line
 
 
 # --------------------------------------------------------------------------------------------

@@ -330,7 +330,7 @@ def test_experiment_file_opens_its_recording(tmp_path: Path) -> None:
     report = inspected(experiment, "dataset.stride=2")
     assert "frames 3 over 2 s" in report
     assert "WARNING recording: the odometry is synthetic" in report
-    with pytest.raises(ConfigError, match="did you mean stride"):
+    with pytest.raises(ConfigError, match=r"did you mean dataset\.stride"):
         inspect_recording(experiment, ["dataset.strid=2"])
 
 

@@ -125,7 +125,7 @@ def test_odometry_beside_colour_and_depth(tmp_path: Path, name: str) -> None:
     assert step is not None
     assert np.allclose(step.motion[:3, 3], [0.02, 0.0, 0.0], rtol=0.0, atol=1e-6)
     assert np.allclose(recording.rig.bTc[:3, 2], [1.0, 0.0, 0.0])  # it looks where the body goes
-    said = "(dataset.camera_yaw_deg and lever_arm_m say otherwise)"
+    said = "(dataset.camera_yaw_deg and dataset.lever_arm_m say otherwise)"
     assert any(note.endswith(said) for note in recording.notes)
     placed = opened(root, lever_arm_m=(0.1, 0.0, 0.5))
     assert np.allclose(placed.rig.bTc[:3, 3], [0.1, 0.0, 0.5])
