@@ -512,9 +512,9 @@ def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
         else:
             placed = _rig_of_topics(settings, bag, chosen)
     except CalibrationError as fault:
-        text = str(fault).removesuffix("; correct the file")
-        if settings.camera_file is not None or text == str(fault):
+        if settings.camera_file is not None:
             raise
+        text = str(fault).removesuffix("; correct the file")
         raise CalibrationError(f"{text}; give the calibration by --camera FILE") from None
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
         rig, notes = mounted(placed.rig, settings), placed.rig.remarks
@@ -560,7 +560,7 @@ def _rig_of_depth(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     elif colour and depth and colour != depth and not is_registered(chosen.left):
         text = f"{chosen.left} is in the frame {depth}, {chosen.right} in {colour}"
     if text and not settings.topics:
-        raise CalibrationError(
+        raise DatasetError(
             f"{settings.path}: {text}: depth must be registered to colour; record the driver's "
             "aligned or registered depth, or choose: --topics COLOUR,DEPTH"
         )
@@ -572,9 +572,7 @@ def _rig_of_depth(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
         # Registered depth has the colour camera's calibration.
         topic = chosen.infos[1] or chosen.infos[0]
         if topic is None:
-            raise CalibrationError(
-                f"{settings.path}: no camera_info of {chosen.right}; give one by --camera FILE"
-            )
+            raise CalibrationError(f"{settings.path}: no camera_info of {chosen.right}")
         values = _info_of(settings, bag, topic, _is_rectified(chosen.right))
         read = read_camera_info(Path(f"{settings.path}:{topic}"), values)
         camera = at_size(read, bag.size, settings.resized).cameras[0]
@@ -591,7 +589,7 @@ def _rig_of_topics(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     if lacking:
         raise CalibrationError(
             f"{settings.path}: no camera_info belongs to {' and '.join(lacking)}, and one camera's "
-            "states nothing of the other; give the calibration of both by --camera FILE"
+            "states nothing of the other"
         )
     topics = [str(topic) for topic in chosen.infos]
     rectified = _is_rectified(chosen.left) and _is_rectified(chosen.right)
@@ -627,10 +625,8 @@ def _rig_by_tree(
         fTc, reported = view_axes(bag.tree, left, right, "")
         apart = inverse(fTc) @ bag.tree.pose(left, right) @ fTc
     except CalibrationError as fault:
-        raise CalibrationError(
-            f"{source}: projection_matrix has no baseline, and {fault}; give the "
-            "calibration of both by --camera FILE"
-        ) from None
+        text = f"{source}: projection_matrix has no baseline, and {fault}"
+        raise CalibrationError(text) from None
     cameras = tuple(
         replace(read_camera_info(file, info).cameras[0], name=str(topic), bTc=place)
         for file, info, topic, place in zip(
@@ -662,8 +658,7 @@ def _info_of(settings: BagSettings, bag: Bag, topic: str, rectified: bool) -> In
     )
     if not k[0] and (not p[0] or (any(d) and not rectified)):
         raise CalibrationError(
-            f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are 0); "
-            "calibrate it, and give the calibration of all cameras by --camera FILE"
+            f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are 0)"
         )
     (across, down), (x, y, width, height) = info["binning"], info["roi"]
     whole = (info["image_width"], info["image_height"])

@@ -30,9 +30,9 @@ from fgslam.datasets.images import (
     Depth,
     DepthLoader,
     ImageLoader,
+    first_size,
     read_colour_image,
     read_depth_image,
-    read_grey_image,
     readable,
     require_size,
 )
@@ -184,10 +184,9 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
     root = Path(settings.path)
     (pairs, unpaired, pairing), (stamps, assumed, lists, timing) = _pairs(root, settings.fps)
     faults: list[FrameError] = []
-    first = next(readable(read_grey_image, (colour for colour, _ in pairs), faults), None)
-    if first is None:
+    size = first_size((colour for colour, _ in pairs), faults)
+    if size is None:
         raise DatasetError(f"{root}: not one colour image can be read: {faults[-1]}")
-    size = first.shape[1], first.shape[0]
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
     rig = mounted(depth_rig(camera), settings)

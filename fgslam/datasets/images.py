@@ -165,9 +165,11 @@ def list_numbered_images(folder: Path) -> dict[int, Path]:
     return numbered
 
 
-def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Width and height of the first image that can be read; None without any."""
-    image = next(readable(read_grey_image, paths), None)
+def first_size(
+    paths: Iterable[Path], faults: list[FrameError] | None = None
+) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None without any; see readable."""
+    image = next(readable(read_grey_image, paths, faults), None)
     return None if image is None else (image.shape[1], image.shape[0])
 
 

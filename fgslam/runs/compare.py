@@ -167,7 +167,11 @@ def _override(settings: Any, config: Experiment, overrides: Sequence[str]) -> An
     values = config.model_copy(update={"estimator": settings}).as_values() | {"compare": []}
     before = len(_PREFIX) + len(settings.title)
     moved = [f"estimator{override[before:]}" for override in overrides]
-    found = make_experiment(values, f"--set {overrides[0]}", moved).estimators[0]
+    try:
+        found = make_experiment(values, f"--set {overrides[0]}", moved).estimators[0]
+    except ConfigError as error:  # which names keys of the configuration
+        own = f"{_PREFIX}{settings.title}."
+        raise ConfigError(str(error).replace("estimator.", own)) from None
     if found.kind != settings.kind:
         raise ConfigError(f"--set {overrides[0]}: the kind is what names it; use --estimators")
     return found

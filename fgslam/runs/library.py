@@ -281,16 +281,13 @@ def run_trials(
     of_run = is_run_folder(source)
     file = source / RUN_MARKER if of_run else source
     config = load_experiment(file, choice.of_experiment)
-    if not isinstance(config, ExperimentConfig | HomingTrialsConfig):
-        raise ConfigError(
-            f"{source}: task {config.task_name} has no trials of estimators side by side; "
-            "--trials needs an experiment of SLAM or of the task homing_trials"
-        )
     worlds = RenderedLabSettings | SimulatedMeasurementsSettings
-    if isinstance(config, ExperimentConfig) and not isinstance(config.dataset, worlds):
+    if not isinstance(config, ExperimentConfig | HomingTrialsConfig) or (
+        isinstance(config, ExperimentConfig) and not isinstance(config.dataset, worlds)
+    ):
         raise ConfigError(
-            f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "
-            "--trials needs a rendered_lab or simulated_measurements data set"
+            f"{source}: has one world of noise alone; --trials needs the dataset.kind rendered_lab "
+            "or simulated_measurements, or the task homing_trials"
         )
     estimators = choose(config, choice.of_estimators)
     folder = out or (source / "trials" if of_run else Path("runs") / f"{config.name}_trials")

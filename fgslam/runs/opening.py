@@ -10,6 +10,7 @@ from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import with_synthetic_odometry
 from fgslam.datasets.settings import (
+    ConstantVelocitySettings,
     MeasurementDatasetSettings,
     RecordedOdometrySettings,
     RenderedLabSettings,
@@ -29,17 +30,11 @@ def open_sequence(config: ExperimentConfig, progress: Progress | None = None) ->
         from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
         # The rendered robot's odometry has its noise among the data set's keys: no key may be idle.
-        if isinstance(config.odometry, SyntheticOdometrySettings):
+        known = config.odometry == RecordedOdometrySettings()
+        if not (known or isinstance(config.odometry, ConstantVelocitySettings)):
             raise ConfigError(
-                "odometry.kind synthetic is for recordings; the rendered lab has wheels of its "
-                "own: choose recorded or constant_velocity"
-            )
-        if isinstance(config.odometry, RecordedOdometrySettings) and (
-            config.odometry != RecordedOdometrySettings()
-        ):
-            raise ConfigError(
-                "keys of `odometry` other than kind mean nothing to the rendered lab; set the "
-                "noise of its wheels under dataset.odometry"
+                "the rendered lab has wheels of its own, with their noise under dataset.odometry; "
+                "set odometry.kind to recorded or constant_velocity, and leave out its other keys"
             )
         rendered = None if progress is None else partial(progress, "rendering")
         selected = dataset.start, dataset.stop, dataset.stride

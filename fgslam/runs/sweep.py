@@ -35,6 +35,7 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.yaml_text import plain_values
 from fgslam.datasets.layouts import is_recording
+from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import SimulatedMeasurementsSettings
 from fgslam.evaluation.judging import (
     SIGNIFICANT,
@@ -86,7 +87,7 @@ from fgslam.runs.slam_comparison import judged_apart, load_truth
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, measured_marks, with_marks
 from fgslam.runs.tasks.slam import open_slam
 from fgslam.runs.tasks.slam_map_entry import arrival_of
-from fgslam.runs.tasks.slam_measurements import open_measured, write_log_and_truth
+from fgslam.runs.tasks.slam_measurements import write_log_and_truth
 from fgslam.runs.units import Progress, Stopped
 from fgslam.runs.workers import NOT_BEGUN, Executor, Failed
 from fgslam.slam.replay import replay
@@ -431,7 +432,8 @@ def perform_trial(config: ExperimentConfig, estimators: Sequence[EstimatorSettin
         alone = config.model_copy(update={"compare": (), "output": output})
         if config.on_measurements:
             run.mkdir()
-            write_log_and_truth(run, open_measured(alone))
+            opened = open_measurements(config.dataset, config.seed, config.odometry)  # type: ignore[arg-type]
+            write_log_and_truth(run, opened)
         else:
             run_task(open_slam, alone, run)
         log = MeasurementLog.load(run / LOG_FILE)

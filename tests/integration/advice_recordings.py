@@ -519,10 +519,10 @@ OF_RECORDINGS = {
         r"calibration by (--camera) FILE", r"\1 {}/../camchain.yaml"
     ),
     "bag without calibration": Advice(
-        uncalibrated, r"of both by (--camera) FILE", r"\1 {}/calib.json"
+        uncalibrated, r"belongs to .* by (--camera) FILE", r"\1 {}/calib.json"
     ),
     "a camera that is not calibrated": Advice(
-        zero_info, r"of all cameras by (--camera) FILE", r"\1 {}/calib.json"
+        zero_info, r"numbers are 0.* by (--camera) FILE", r"\1 {}/calib.json"
     ),
     "camera_info without baseline": Advice(
         without_baseline, r"has no baseline.* (--camera) FILE", r"\1 {}/calib.json"

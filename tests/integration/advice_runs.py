@@ -547,12 +547,17 @@ OF_RUNS = {
         command=("sweep", "--jobs 1 --set seed=1 --out {}/s"),
     ),
     "trials of another task": Advice(
-        homing, r"(--trials) needs an experiment of SLAM", mend=experiment,
+        homing, r"--trials needs the dataset.kind rendered_lab or simulated_meas", mend=experiment,
         command=("compare", "--trials 2 --out {}/c"), slow=True,
     ),
     "trials of a recording": Advice(
-        of_images(), r"(--trials) needs a rendered_lab or simulated_measurements", mend=experiment,
+        of_images(), r"--trials needs the dataset.kind \w+ or (simulated_\w+)", mend=experiment,
         command=("compare", "--trials 2 --out {}/c"), slow=True,
+    ),
+    "a setting of an estimator": Advice(
+        run_folder, r"did you mean (estimators.ekf.\w+)\?", r"--estimators ekf --set \1=4",
+        command=("compare", "--estimators ekf --set estimators.ekf.gate_sigma=4"),
+        drop="--estimators ekf --set estimators.ekf.gate_sigma=4",
     ),
     "no images to inspect": Advice(
         experiment, r"holds measurements, no images; choose a recording of images",
@@ -673,11 +678,12 @@ OF_RUNS = {
         unstated_lens, r"\((dataset.lens=\w+) states otherwise\)", r"--set \1", slow=True,
     ),
     "synthetic odometry of the lab": Advice(
-        rendered(), r"(odometry.kind) synthetic is for recordings; .*: choose (\w+)",
-        r"--set \1=\2", command=("run", "--out {}/o --set odometry.kind=synthetic"), slow=True,
+        rendered(), r"set (odometry.kind) to (\w+) or constant_velocity", r"--set \1=\2",
+        command=("run", "--out {}/o --set odometry.kind=synthetic"), slow=True,
     ),
     "noise of the lab's odometry": Advice(
-        rendered(), r"set the noise of its wheels under (dataset.odometry)", r"--set \1.noise=2",
+        rendered(), r"their noise under (dataset.odometry); .* leave out its other keys",
+        r"--set \1.noise=2",
         command=("run", "--out {}/o --set odometry.kind=recorded "
                  "--set odometry.speed_sigma_mps=0.2"),
         drop="--set odometry.speed_sigma_mps=0.2", slow=True,

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.errors import ConfigError
 from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementRecording, write_landmark_truth
 from fgslam.datasets.opening import open_measurements
-from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import read_table, records, write_timing
 from fgslam.runs.config import ExperimentConfig
@@ -23,20 +21,9 @@ from fgslam.runs.tables import FRAMES_FILE
 _NUMBERS = ("inliers", "solve_ms", "update_ms")
 
 
-def open_measured(config: ExperimentConfig) -> MeasurementRecording:
-    """The recording that the configuration names, simulated with its seed.
-
-    Raises:
-        FgslamError: it cannot be opened; images are no measurements (ConfigError).
-    """
-    if not isinstance(config.dataset, MeasurementDatasetSettings):
-        raise ConfigError(f"dataset.kind {config.dataset.kind} holds images, no measurements")
-    return open_measurements(config.dataset, config.seed, config.odometry)
-
-
 def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[RunResult]:
     """Opens or simulates the recording. Raises FgslamError."""
-    recording = open_measured(config)
+    recording = open_measurements(config.dataset, config.seed, config.odometry)  # type: ignore[arg-type]
     return Task(provenance_of(recording), lambda context: _run(config, recording, context))
 
 

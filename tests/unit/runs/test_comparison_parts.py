@@ -133,7 +133,7 @@ def test_overrides_reach_one_estimator() -> None:
         ("estimators.batch.method=gnc", "NAME one of landmark_kalman, isam2"),
         ("isam2.update_every=3", "estimators.NAME.key=value with NAME one of landmark_kalman"),
         ("dataset.stop=3", "what was measured stays as it is; .* or --trials to run"),
-        ("estimators.isam2.updat_every=3", "did you mean update_every"),
+        ("estimators.isam2.updat_every=3", "did you mean estimators.isam2.update_every"),
         ("estimators.isam2.update_every=0", "is not usable"),
         ("estimators.isam2.kind=batch", "the kind is what names it"),
     ],
