@@ -468,7 +468,7 @@ _BODY = (
 )
 _ODOMETRY = "the odometry is wrong in {count} frames, {span}, which are located without it: "
 _PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "
-_WATCH = "frontend.watch_cameras: false uses them all"
+_WATCH = "--set frontend.watch_cameras=false uses them all"
 _FASTEN = (
     "as points off their lines show: fasten it and calibrate the rig again; what is measured from "
     "there on may be wrong"

@@ -70,10 +70,6 @@ class DenseSettings:
         for name, value in lengths.items():
             if value is not None and not 0.0 < value < np.inf:
                 raise ConfigError(f"--{name} is {value:g}; give metres above 0, or leave it out")
-        if self.cameras not in (None, 2, 3):
-            raise ConfigError(
-                f"--cameras is {self.cameras}; a rig has 2 or 3, leave it out for all"
-            )
         if self.every < 1:
             raise ConfigError(f"--every is {self.every}; give 1 for all frames, 2 for every second")
 
@@ -161,8 +157,8 @@ def fuse(
         DatasetError: no image can be read, or none shows any depth.
     """
     settings, rig = settings or DenseSettings(), log.rig
-    if settings.cameras is not None and settings.cameras > rig.cameras:
-        raise ConfigError(f"--cameras 3: the rig has {rig.cameras}; leave it out")
+    if settings.cameras not in (None, *range(2, rig.cameras + 1)):
+        raise ConfigError(f"--cameras {settings.cameras}: the rig has {rig.cameras}; leave it out")
     used = list(range(0, len(rows), settings.every))
     if depths is None:
         measured = _by_matching(log, pictures, settings.cameras)

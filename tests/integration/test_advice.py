@@ -89,8 +89,8 @@ def messages(folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("rooms", "most"),
     [
-        (("datasets", "cameras"), 19),
-        pytest.param(("",), 57, marks=pytest.mark.slow),
+        (("datasets", "cameras"), 18),
+        pytest.param(("",), 46, marks=pytest.mark.slow),
     ],
 )
 def test_messages_that_name_an_option_are_provoked_more_and_more(

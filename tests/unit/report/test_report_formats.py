@@ -141,7 +141,7 @@ def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="No such file"):
         read_ply(path)
     path.write_text("OFF\n")
-    with pytest.raises(DatasetError, match=r"not a \.ply"):
+    with pytest.raises(DatasetError, match="no landmark map; give"):
         read_ply(path)
     write_map(path, a_map(5))
     whole = path.read_bytes()
@@ -149,13 +149,13 @@ def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="cut off"):
         read_ply(path)
     path.write_bytes(whole.replace(b" hits\n", b" hots\n"))
-    with pytest.raises(DatasetError, match="no line 'property int hits'"):
+    with pytest.raises(DatasetError, match="no landmark map"):
         read_ply(path)
     path.write_bytes(whole.replace(b"binary_little_endian", b"ascii"))
-    with pytest.raises(DatasetError, match="no line 'format binary_little_endian"):
+    with pytest.raises(DatasetError, match="no landmark map"):
         read_ply(path)
     path.write_bytes(whole.replace(b"property double x", b"property list uchar int x"))
-    with pytest.raises(DatasetError, match="no line 'property double x'"):
+    with pytest.raises(DatasetError, match="no landmark map"):
         read_ply(path)
 
 
