@@ -461,9 +461,39 @@ def ending(fault: Fault) -> Fault:
     return act
 
 
-def late(drive: Drive) -> Drive:
-    """Odometry of the step before."""
-    return replace(drive, odometry=[None, *drive.odometry[1:2], *drive.odometry[1:-1]])
+def late(frames: int) -> Fault:
+    """Odometry of so many steps before."""
+    return lambda d: replace(d, odometry=[None, *d.odometry[1:2] * frames, *d.odometry[1:-frames]])
+
+
+def axes(drive: Drive) -> Drive:
+    """Odometry in axes of another convention: x where z should be, and so on."""
+    turn = pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+    steps = [s and replace(s, motion=turn @ s.motion @ inverse(turn)) for s in drive.odometry]
+    return replace(drive, odometry=steps)
+
+
+def alone(fault: Fault) -> Fault:
+    """A fault of images, where nothing measures odometry."""
+    return lambda drive: fault(replace(drive, odometry=[None] * len(drive)))
+
+
+def calibrated(**factors: float) -> Fault:
+    """Numbers of the rig, as stated, that are so many times the true ones."""
+
+    def act(drive: Drive) -> Drive:
+        numbers = {name: factor * getattr(drive.rig, name) for name, factor in factors.items()}
+        return replace(drive, rig=replace(drive.rig, **numbers))
+
+    return stated(act)
+
+
+def _dark(drive: Drive, k: int) -> tuple[Image, Image]:
+    if k >= BEGINS + LASTS:
+        return drive.images[k]
+    noise = np.random.default_rng(k).normal(0.0, 1.0, (2, *drive.images[k][0].shape))
+    left, right = (_grey(0.02 * one + n) for one, n in zip(drive.images[k], noise, strict=True))
+    return left, right
 
 
 def turning(scale: float) -> Fault:
@@ -536,9 +566,24 @@ FAULTS: dict[str, tuple[Fault, tuple[str, ...]]] = {
     "ten images shuffled": (images_of(_shuffled), ("road", "lab", "kitti06", "room")),
     "reflection": (images_of(_reflecting), ("road", "lab", "kitti06")),
     "poster carried along": (body(0.0, 0.3, 0.6, 0.5), ("road", "lab")),
-    "odometry late": (late, ("road", "lab")),
+    "odometry late": (late(1), ("road", "lab")),
     "turns x 0.9": (turning(0.9), ("road", "lab", "room")),
     "wheels x 0.8": (wheels(0.8), ("road", "lab", "room")),
+    "wheels in cm": (wheels(100.0), ("lab", "kitti06", "drone")),
+    "wheels in km": (wheels(0.001), ("lab", "kitti06", "drone")),
+    "turns in degrees": (turning(57.3), ("lab", "kitti06", "drone")),
+    "turns reversed": (turning(-1.0), ("lab", "kitti06", "drone")),
+    "axes swapped": (axes, ("lab", "kitti06", "drone")),
+    "odometry late by 5": (late(5), ("lab", "kitti06", "drone")),
+    "baseline x 1.2": (calibrated(baseline=1.2), ("lab", "kitti06", "drone")),
+    "focal length x 1.1": (calibrated(fx=1.1, fy=1.1), ("lab", "kitti06", "drone")),
+    "light off": (images_of(_dark), ("lab", "kitti06", "drone")),
+    "left upside down": (
+        images_of(lambda d, k: (d.images[k][0][::-1, ::-1].copy(), d.images[k][1])),
+        ("lab", "kitti06", "drone"),
+    ),
+    "out of order, no odometry": (alone(images_of(_out_of_order)), ("lab", "kitti06")),
+    "ten shuffled, no odometry": (alone(images_of(_shuffled)), ("lab", "kitti06")),
 }
 """Faults, and the recordings that each is tried on."""
 

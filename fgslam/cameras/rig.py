@@ -522,6 +522,8 @@ _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 # Longer than nearly any vehicle carries (cars have 0.3 to 0.6 m); webcams of 60 mm calibrated in
 # squares of 20 to 30 mm have 2 to 3, in millimetres even an eye's 10 mm are more.
 _LONGEST_BASELINE_M = 1.0
+# Of the size, that a lens sits off the middle of its sensor; resized images differ by a third.
+_OFF_MIDDLE = 0.1
 # Cosine of 45 degrees: beyond, a common image plane would magnify the rims out of use.
 _LEAST_COMMON_VIEW = 0.707
 # A stated view with less of the raw resolution than this has collapsed.
@@ -590,13 +592,23 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
 
 
 def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:
-    """A remark where no vehicle carries cameras so far apart."""
-    if rig.baseline <= _LONGEST_BASELINE_M:
-        return ()
-    return (
-        f"{source}: the baseline is {rig.baseline:.4g} m; if its unit is not the metre, give it: "
-        "--unit 0.001 for millimetres, or the side of a square in metres (unit_m of load_rig)",
-    )
+    """Remarks where no vehicle carries cameras so far apart, and on numbers of another size."""
+    remarks = []
+    if rig.baseline > _LONGEST_BASELINE_M:
+        remarks.append(
+            f"{source}: the baseline is {rig.baseline:.4g} m; if its unit is not the metre, give "
+            "it: --unit 0.001 for millimetres, or the side of a square in metres (unit_m of "
+            "load_rig)"
+        )
+    across, down = 2.0 * rig.cx / rig.width, 2.0 * rig.cy / rig.height
+    middle = math.sqrt(max(across * down, 0.0))
+    if abs(across - down) < _OFF_MIDDLE and abs(middle - 1.0) > 2.0 * _OFF_MIDDLE:
+        remarks.append(
+            f"{source}: the principal point ({rig.cx:.1f}, {rig.cy:.1f}) is the middle of images "
+            f"{middle:.2f} times as large as these, of {rig.width}x{rig.height} pixels: are fx, "
+            "fy, cx and cy those of another resolution?"
+        )
+    return tuple(remarks)
 
 
 def _require_rig_cameras(calibration: Calibration) -> None:

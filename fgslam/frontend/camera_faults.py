@@ -484,6 +484,7 @@ class CameraWatch:
     _before: Kept[Sequence[Image]]
     _sums: Kept[list[int]]
     _frames: Kept[int]
+    _doubled: Kept[int]
 
     def __init__(self, rig: CameraRig) -> None:
         """Nothing seen yet."""
@@ -495,7 +496,7 @@ class CameraWatch:
         self._late = [False] * rig.cameras
         self._before = []
         self._sums = [-1] * rig.cameras
-        self._frames = 0
+        self._frames = self._doubled = 0
         self._same = np.zeros(rig.cameras, np.bool_)
         self.alone: int | None = None
         """Of the last frame, if it is refused: the first camera whose image is usable."""
@@ -593,7 +594,8 @@ class CameraWatch:
             for k, pair in enumerate(self._pairs, 1)
             if pair.unequal
         ]
-        return (*self._turns.remarks(), *unequal)
+        doubled = [Remark("images_doubled", values={"count": self._doubled})]
+        return (*self._turns.remarks(), *unequal, *doubled * (self._doubled > _FEW))
 
     # ----------------------------------------------------------------------------------------
 
@@ -602,6 +604,7 @@ class CameraWatch:
         before = self._sums
         self._sums = [zlib.crc32(image.tobytes()) for image in images]
         same = [a == b for a, b in zip(before, self._sums, strict=True)]
+        self._doubled += all(same) and not self._same.any()  # of a robot that stands all are
         self._same = np.array(same)
         black = np.array([(image[::4, ::4] >= _DARKEST).mean() <= 0.01 for image in images])
         if black.any() and not black.all():

@@ -467,6 +467,20 @@ _BODY = (
     "{low:.0f} and {high:.0f} % of the width, contradict the odometry; "
 )
 _ODOMETRY = "the odometry is wrong in {count} frames, {span}, which are located without it: "
+_ERRS = {
+    "odometry_reversed": "it is the motion backwards ({ratio:.2f} of the way that images show): "
+    "give the pose now in the frame before, not its inverse",
+    "odometry_scaled": "its ways are {ratio:.2f} +- {scatter:.2f} of those that images show "
+    "(wheel radius, unit; or the rig's baseline is not as stated)",
+    "odometry_slips": "images show other ways, by no factor that stays (the wheels slip, its "
+    "clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
+    "odometry_stuck": "it states no motion while images show one",
+    "odometry_turned": "its motions are {degrees:.0f} degrees off the direction in which images "
+    "show them (the axes of its frame, or dataset.camera_yaw_deg)",
+    "odometry_turns": "its turns are {ratio:.2f} +- {scatter:.2f} of those that images show "
+    "(degrees or radians, or the sign of the yaw)",
+}
+"""How odometry errs, by the code of a remark on it."""
 _PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "
 _WATCH = "--set frontend.watch_cameras=false uses them all"
 _FASTEN = (
@@ -488,8 +502,11 @@ SENTENCES = {
     "camera_turned": "the {camera} camera was turned by {turns}{against} at about frame {first} "
     "of the run, " + _FASTEN,
     "cameras_swapped": _PREDICTED + "(swap their images; " + _WATCH + ")",
+    "images_doubled": "{count} times all images are those of the frame before, to the bit, and "
+    "then others: the recording has frames twice, whose poses are late (leave them out: --stride)",
     "images_out_of_order": "the images of {count} frames, {span}, are out of order: they jump to "
-    "and fro while odometry goes on evenly (sort them by the time at which they were taken)",
+    "and fro, and fit the motion in another order (sort them by the time at which they were "
+    "taken)",
     "left_out": "the first {count} frames could not be located: left out",
     "lost_bits": "{fault}",
     "no_features": _NO_MATCHES + "{left}; are the images dark, or 12-bit values in 16-bit images?",
@@ -497,24 +514,23 @@ SENTENCES = {
     "no_matches_fault": _NO_MATCHES + "; {fault}",
     "one_image": "{fault}: {count} of {all} frames, {span}, are located by that image and begin no "
     "landmark (mend the camera; " + _WATCH + ")",
-    "odometry_reversed": _ODOMETRY + "it is the motion backwards ({ratio:.2f} of the way that "
-    "images show): give the pose now in the frame before, not its inverse",
-    "odometry_scaled": _ODOMETRY + "its ways are {ratio:.2f} +- {scatter:.2f} of those that images "
-    "show (wheel radius, unit)",
-    "odometry_slips": _ODOMETRY
-    + "images show other ways, by no factor that stays (the wheels slip, "
-    "its clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
-    "odometry_stuck": _ODOMETRY + "it states no motion while images show one",
+    **{code: _ODOMETRY + errs for code, errs in _ERRS.items()},
     "other_motion": "in {count} frames, {span}, something else moves rigidly, with up to "
     "{percent:.0f} % as many matches as the pose follows: something large passes. Without odometry "
     "the pose is uncertain where that fills more of the view than the scene, for it may follow "
     "what passes (leave these frames out: --start, --stop)",
+    "pairs_unmatched": "right and left image have next to nothing in common in {count} frames, "
+    "{span}: {features:.0f} features in the right image, {matched:.0f} of them matched; is one of "
+    "them dark, covered, turned, mirrored, moved off its lines, or of another place or moment?",
     "rig_doubted": "the cameras seem to have moved against each other at about frame {first} of "
     "the run; too few frames have followed to decide it",
     "rig_loose": "the cameras move against each other, {count} times from about frame {first} of "
     "the run on: what is measured from there on may be wrong; fasten them and calibrate again",
     "rig_moved": "the cameras moved against each other at about frame {first} of the run: "
     "corrected from there on; fasten them and calibrate the rig again",
+    "scale_doubted": "the odometry's ways are {ratio:.2f} of those that images show, and nothing "
+    "in view shows which errs (wheel radius or unit; baseline or focal length of the rig): the "
+    "covariances hold both",
     "scene_repeats": "the scene repeats itself in {count} frames, {span}: images fit several "
     "places alike, the pose is by odometry",
     "unconnected": "{named}: located relative to each other only, not in the first map; before is "
@@ -539,4 +555,7 @@ def sentence(remark: Remark | str) -> str:
         span = f"from {first} to {last}" if n > 1 else f"frame {first}"
         of_frames = {"count": n, "first": first, "last": last, "span": span}
         of_frames["named"] = f"{n} frames {span}" if n > 1 else span
-    return SENTENCES[remark.code].format(**of_frames, **remark.values)
+    text = SENTENCES[remark.code]
+    if errs := remark.values.get("errs"):  # which of the two errs is open
+        text += "; if the odometry errs, " + _ERRS[str(errs)]
+    return text.format(**of_frames, **remark.values)

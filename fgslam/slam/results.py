@@ -437,7 +437,7 @@ def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
 
 
 def _image_remarks(recorder: RunRecorder, seen: FirstImages) -> Iterator[Remark]:
-    """Whether the first frames with images have next to no stereo match, or lost bits."""
+    """Whether the first frames, or later ones, have next to no stereo match; or lost bits."""
     rows = [row for row in recorder.rows if not row.problem][:_FRAMES]
     features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
     if len(rows) < _FEWEST:
@@ -445,6 +445,18 @@ def _image_remarks(recorder: RunRecorder, seen: FirstImages) -> Iterator[Remark]
     if matched > _LEAST_MATCHED * features:
         if seen.lost_bits():
             yield Remark("lost_bits", values={"fault": seen.lost_bits()})
+        pairs = zip(recorder.log.numbers.tolist(), recorder.rows, strict=True)
+        lost = [
+            (number, row)
+            for number, row in pairs
+            if not (row.problem or EgoMotionStatus(row.status).measured)
+            and row.stereo <= _LEAST_MATCHED * row.features
+        ]
+        if len(lost) >= _FEWEST:
+            numbers, lacking = zip(*lost, strict=True)
+            n, features = len(lost), sum(row.features for row in lacking)
+            values = {"features": features / n, "matched": sum(row.stereo for row in lacking) / n}
+            yield Remark("pairs_unmatched", numbers, values)
         return
     n, values = len(rows), dict[str, float | str]()
     values |= {"count": n, "features": features / n, "matched": matched / n}

@@ -13,6 +13,8 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import pairwise
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,6 +27,7 @@ from fgslam.core.geometry import (
     motion_covariance,
     rotate_covariances,
     se3_log,
+    so3_log,
     transform_to_world,
 )
 from fgslam.core.sensors import Increment, Odometry
@@ -49,6 +52,7 @@ Verdict: TypeAlias = Literal["agreed", "images", "odometry", "undecided"]
 _GATE = 40.0
 """Chi-square, six degrees of freedom, beyond which the witnesses contradict each other: chance once
 in two million; errors of a map persist, and reach 17 on sound drives."""
+_SIGMAS = 3.0  # by which ways of a whole drive differ: no pose is changed for it
 _MOUNT = 0.02
 """Of the way: a camera's yaw on its robot is known to a degree, a rig's scale to two percent; in no
 covariance is either. Without, a real road contradicts its odometry until the rig is known."""
@@ -56,7 +60,7 @@ _CAP = 10.0  # of each kind of evidence in a frame, so that none decides for eve
 _MOST = 20.0  # of the score: a hypothesis that turns out wrong is left within frames
 _DECIDED = 3.0  # odds of 20 to 1
 _BY_CHANCE = 0.25  # of matches around a wrong pose, share that fits it nevertheless
-_SLACK = 3.0  # taken off what such matches tell: the pose was fitted to them
+_SLACK = 3.0  # taken off what such matches or motions tell: what explains them was fitted
 _PROVEN = 1.16  # of a landmark seen again from elsewhere: ln of 0.8 over 0.25
 _SIGHTINGS, _MOVED_PX = 2, 3.0  # that prove a landmark: a hood stays where it is in the image
 _LOWE, _ELSEWHERE_PX = 0.8, 5.0  # a twin: as near by its descriptor, elsewhere in the same image
@@ -65,8 +69,10 @@ _ENDS = 5  # agreeing frames in a row end an episode
 _RATIOS, _FEWEST_RATIOS = 15, 5  # contradicted frames that tell the ratio of the ways
 _STUCK = 0.05  # ratio of ways that counts as none: a hood shows that, too
 _NAMED = 3  # frames of a kind, from which on a cause is named
-_JUMPS, _UNEVEN = 2, 2.0  # back and on again; by twice what odometry's ways change
-_STEADY = 0.1  # scatter of the ways' ratio: of wheels that slip it is many times that
+_JUMPS = 2  # of images that are out of order: away, and back
+_STEADY = 0.1  # scatter of the ways' ratio, or radians: of wheels that slip it is many times that
+_TURN_AND_WAY = slice(0, 3), slice(3, 6)
+_WITNESSES = "by_images", "by_odometry"
 _EXACT = 1e-12 * np.eye(6)  # a covariance that states no error at all
 
 
@@ -78,16 +84,21 @@ class Witnesses:
             last one, as it is now.
         apart: frames that followed the images while odometry's pose was another.
         found: all contradicted frames.
+        disordered: numbers of the frames whose images belong to other frames.
     """
 
     score: Kept[list[float]]
     apart: Kept[list[Apart]]
     found: Kept[list[Contradiction]]
+    disordered: Kept[list[int]]
+    _shown: Kept[list[Shown]]
+    _jumping: Kept[bool]
     _agreeing: Kept[int]
     _other: Kept[Apart | None]
     _erred: Kept[FloatArray]
     _agreed_m: Kept[float]
     _relative: Kept[FloatArray]
+    _scale: Kept[FloatArray]
     _proofs: Kept[Proofs]
     _body: Kept[ByteArray]
     _seen: Kept[IntArray]
@@ -96,16 +107,18 @@ class Witnesses:
     def __init__(self, tracker: LandmarkTracker, follows_images: bool = True) -> None:
         """Nothing contradicts anything yet, nor ever if the pose never follows the images."""
         self._tracker, self._follows_images = tracker, follows_images
-        self.score, self.apart, self.found = [], [], []
+        self.score, self.apart, self.found, self.disordered = [], [], [], []
+        self._shown, self._jumping = [], False  # the last frames; images, in this episode
         self._agreeing = _ENDS
         self._other = None  # of the last frame
         self._erred = np.zeros(6)  # odometry, where the images contradicted it last
         self._agreed_m = 0.0  # way since then
         self._relative = np.zeros((6, 6))  # covariance of the last pose, relative to its landmarks
+        self._scale = np.zeros(2)  # information and score of the images' scale over odometry's
         self._proofs = Proofs.none()
         self._body, self._seen = np.empty((0, 128), np.uint8), np.empty(0, np.int64)
         self._rows = 0
-        self._judged = False
+        self._judged: EgoMotion | None = None  # the pose of a frame as images have it
 
     # -- one frame -----------------------------------------------------------------------------
 
@@ -114,7 +127,7 @@ class Witnesses:
         step = frame.odometry
         if step is None or not step.measured or not self._follows_images:
             return False
-        if self._other or self._jumping() or tracking.status is EgoMotionStatus.CAPPED:
+        if self._other or self._jumping or tracking.status is EgoMotionStatus.CAPPED:
             return True
         return self._squared(step, frame.prediction, tracking) > _GATE
 
@@ -137,8 +150,9 @@ class Witnesses:
         """
         step = frame.odometry
         if step is None or not step.measured or not self._follows_images:
-            return Judged(tracked, "agreed", frame.odometry)
-        self._judged = True
+            doubted = self._jumping and tracked.ego_motion.status.measured
+            return Judged(_doubted(tracked) if doubted else tracked, "agreed", step)
+        self._judged = tracked.ego_motion
         body = self._body_in(frame.features)
         tracked = _beginning_none(tracked, body)
         agreed = Judged(tracked, "agreed", frame.taken)
@@ -147,7 +161,7 @@ class Witnesses:
         free = found.status is EgoMotionStatus.CAPPED
         images = self._of_images(frame, tracked) if free else tracked
         far = found.status.measured and self._contradicted(frame, images)
-        jumps = self._jumping()
+        jumps = self._jumping
         if not far and here is None:
             self._agreeing += 1
             if jumps:  # by chance: of which moment it is, nothing shows
@@ -159,6 +173,7 @@ class Witnesses:
             images = tracked
         elif not free:
             images = self._of_images(frame, tracked)
+        self._judged = images.ego_motion
         chain = self._chain(frame)
         odometry = self._of_odometry(frame, images, chain)
         self._weigh(odometry, far, body, jumps)
@@ -180,16 +195,16 @@ class Witnesses:
         if not far:
             return agreed
         if verdict == "undecided":
-            doubted = replace(images.ego_motion, status=EgoMotionStatus.CONTRADICTED)
-            images = replace(images, ego_motion=doubted)
+            images = _doubted(images)
         return Judged(images, verdict, frame.step)
 
     def observe(self, increment: Increment, tracking: EgoMotion) -> None:
         """Ends a frame: counts agreement, proves landmarks, goes on with odometry's chain."""
-        judged, self._judged = self._judged, False
+        judged, self._judged = self._judged, None
         step = increment.odometry
+        self._look_for_order(increment, judged or tracking)
         known = step is not None and step.measured
-        if not judged:
+        if judged is None:
             self._agreeing += 1
             if step is not None and self._other is not None:
                 there = inverse(step.motion) @ self._other.iTo @ step.motion
@@ -199,7 +214,7 @@ class Witnesses:
         if step is not None and self._agreeing:
             self._agreed_m += float(np.linalg.norm(step.motion[:3, 3]))
         if self._agreeing >= _ENDS:
-            self._other = None
+            self._other, self._jumping = None, False
             seen = increment.kept
             if known and tracking.status.measured:
                 self._proofs = self._proofs.seen(seen.ids, seen.measurement[:, :2])
@@ -222,12 +237,15 @@ class Witnesses:
         Relative to landmarks seen lately that is the odometry's step; of ``old`` ones, to which
         the drive returns, what the prediction states.
         """
+        noise = self._noise(step, tracking) + (prediction.covariance if old else 0.0)
+        return _squared(self._tracker.constrained(prediction).wTc, tracking.wTc, noise)
+
+    def _noise(self, step: Odometry, tracking: EgoMotion) -> FloatArray:
+        """(6, 6) what a step, the poses around it and the camera's place on its robot explain."""
         noise = compose_covariance(step.motion, self._relative, step.covariance)
-        noise = noise + tracking.covariance + (prediction.covariance if old else 0.0) + _EXACT
+        noise = noise + tracking.covariance + _EXACT
         noise[3:, 3:] += np.eye(3) * (_MOUNT * np.linalg.norm(step.motion[:3, 3])) ** 2
-        around = self._tracker.constrained(prediction).wTc
-        off = se3_log(inverse(around) @ tracking.wTc)
-        return float(off @ np.linalg.solve(noise, off))
+        return noise
 
     def _contradicted(self, frame: Frame, tracked: Tracked) -> bool:
         used = tracked.expected.ids[tracked.matches.landmarks[tracked.ego_motion.inliers]]
@@ -326,9 +344,8 @@ class Witnesses:
             return False
         if self._other is None:
             return self._squared(frame.step, chain, pose) > _GATE
-        off = se3_log(inverse(self._tracker.constrained(chain).wTc) @ pose.wTc)
         noise = chain.covariance + pose.covariance + _EXACT
-        return float(off @ np.linalg.solve(noise, off)) > _GATE
+        return _squared(self._tracker.constrained(chain).wTc, pose.wTc, noise) > _GATE
 
     def _rejoined(self, frame: Frame, pose: EgoMotion, chain: Prediction) -> bool:
         """Whether what the images show, after frames that followed them, is odometry's chain."""
@@ -366,11 +383,13 @@ class Witnesses:
     def _weigh(self, odometry: Odometrys, far: bool, body: IntArray, jumps: bool) -> None:
         """Adds a frame's evidence to the score, each kind no more than its cap."""
         fits, of = len(odometry.ids), odometry.against
+        # What began in frames that do not repeat has another reason.
+        repeats = [odometry.repeats, *(one.repeats for one in self._lately())]
         proven = self._proofs.proven
         kinds = [
             _surprise(fits, of) - _SLACK if fits > _BY_CHANCE * of else 0.0,
             _PROVEN * proven(odometry.ids),
-            _CAP * (odometry.repeats and far),
+            _CAP * (far and 2 * sum(repeats) >= len(repeats) and odometry.repeats),
             _CAP * (2 * len(np.intersect1d(odometry.features, body)) > len(odometry.features)),
         ]
         total = sum(min(max(kind, 0.0), _CAP) for kind in kinds)
@@ -381,9 +400,35 @@ class Witnesses:
         score = min(max(self.score[-1] + total, -_MOST), _MOST)
         self.score[-1] = _MOST if odometry.rejoined or jumps else score
 
-    def _jumping(self) -> bool:
-        """Whether images jump to and fro in this episode, which has not ended."""
-        return self._agreeing < _ENDS and to_and_fro(self._lately())
+    @property
+    def _longer(self) -> float:
+        """Share by which ways of all agreed frames are longer in images, beyond what is known."""
+        information, score = self._scale.tolist()
+        longer = score / max(information, 1e-12)
+        known = math.hypot(_MOUNT, max(information, 1e-12) ** -0.5)
+        return longer if abs(longer) > _SIGMAS * known else 0.0
+
+    def _look_for_order(self, increment: Increment, pose: EgoMotion) -> None:
+        """Whether the images of the last frames belong to others of them."""
+        step = increment.odometry
+        if step is None or not pose.status.measured:
+            self._shown = []
+            return
+        noise = self._noise(step, pose)
+        here = Shown(increment.index, step.measured, pose.wTc, step.motion, noise)
+        self._shown = [*self._shown, here][-_RATIOS:]
+        if len(self._shown) > 1 and step.measured:
+            expected = self._shown[-2].wTc @ step.motion
+            if _squared(expected, pose.wTc, noise) < _GATE:
+                way = np.append(np.zeros(3), step.motion[:3, 3])
+                known = np.linalg.solve(noise, way)
+                longer = known @ se3_log(inverse(expected) @ pose.wTc)
+                self._scale = self._scale + np.array([known @ way, longer])
+        given, self._shown = self._shown, in_order(self._shown)
+        pairs = zip(given, self._shown, strict=True)
+        if moved := [one.number for one, there in pairs if one.wTc is not there.wTc]:
+            self.disordered = sorted({*self.disordered, *moved})
+            self._jumping, self._agreeing = True, 0
 
     def _lately(self) -> list[Contradiction]:
         """The last contradicted frames of this episode."""
@@ -392,20 +437,13 @@ class Witnesses:
     def _steady(self) -> float:
         """Evidence that odometry errs by a factor: its way is a fixed share of the images'.
 
-        Against what passes with a constant velocity: then the difference of both is fixed.
+        Or its turn of theirs.
         """
         lately = self._lately()
         if len(lately) < _FEWEST_RATIOS:
             return 0.0
-        seen = np.array([one.by_images for one in lately])
-        given = np.array([one.by_odometry for one in lately])
-        ratio = float((seen * given).sum() / max((given * given).sum(), 1e-12))
-        if abs(ratio) < _STUCK:
-            return 0.0
-        factor = float(np.mean((seen - ratio * given) ** 2))
-        passing = float(np.var(seen - given, axis=0).mean())
-        noise = (0.01 * float(np.abs(given).max()) + 0.001) ** 2
-        return 0.5 * len(lately) * math.log((passing + noise) / (factor + noise))
+        seen, given = (np.array([getattr(one, name) for one in lately]) for name in _WITNESSES)
+        return max(_by_factor(seen[:, k], given[:, k]) for k in _TURN_AND_WAY)
 
     def _record(
         self, frame: Frame, images: EgoMotion, odometry: Odometrys, verdict: Verdict
@@ -414,6 +452,13 @@ class Witnesses:
         self._erred = se3_log(inverse(frame.prediction.wTc) @ images.wTc)
         self._agreed_m = 0.0
         before = frame.prediction.wTc @ inverse(frame.step.motion)
+        by_images, by_odometry = (
+            np.append(
+                so3_log(before[:3, :3].T @ wTc[:3, :3]), before[:3, :3].T @ (wTc - before)[:3, 3]
+            )
+            for wTc in (images.wTc, frame.prediction.wTc)
+        )
+        noise = np.diagonal(self._noise(frame.step, images))
         columns = frame.features.measurement[odometry.features, 0] / self._tracker.rig.width
         left, right = np.percentile(columns, (5.0, 95.0)) if len(columns) else (0.0, 0.0)
         share = len(columns) / max(len(columns) + len(odometry.ids), 1)
@@ -423,8 +468,9 @@ class Witnesses:
                 number=frame.number,
                 episode=len(self.score) - 1,
                 verdict=verdict,
-                by_images=images.wTc[:3, 3] - before[:3, 3],
-                by_odometry=frame.prediction.wTc[:3, 3] - before[:3, 3],
+                by_images=by_images,
+                by_odometry=by_odometry,
+                misfit=((by_images - by_odometry) ** 2 / noise).reshape(2, 3).sum(axis=1),
                 view=np.clip([left, right, share], 0.0, 1.0),
                 fits=len(odometry.ids),
                 repeats=odometry.repeats,
@@ -470,7 +516,7 @@ class Witnesses:
 
         Where odometry turned out right, frames that followed the images are placed by its chain.
         """
-        if not self.apart:
+        if not self.apart and not self._longer:
             return estimate
         by_images, relative = estimate.trajectory.poses, {}
         poses, chains = by_images.copy(), np.zeros_like(estimate.covariances)
@@ -518,6 +564,10 @@ class Witnesses:
                     if one.row >= first:
                         iTo[one.row - first] = one.iTo
                 out.append((1.0 / (1.0 + math.exp(-score)), iTo))
+        if self._longer:  # whose scale is wrong is open
+            scaled = poses.copy()
+            scaled[:, :3, 3] /= 1.0 + self._longer
+            out.append((0.5, inverse(poses) @ scaled))
         return out
 
     def _decided(self, one: Contradiction) -> Verdict:
@@ -531,40 +581,80 @@ class Witnesses:
         by = defaultdict[str, list[Contradiction]](list)
         for episode in range(len(self.score)):
             frames = [one for one in self.found if one.episode == episode]
-            jumps = to_and_fro(frames)
+            moved = any(one.number in self.disordered for one in frames)
             for one in frames:
-                by["jumps" if jumps else self._decided(one)].append(one)
+                by["jumps" if moved else self._decided(one)].append(one)
         repeats = [one for one in by["odometry"] if one.repeats]
         bodies = [one for one in by["odometry"] if not one.repeats]
+        errs, values = _odometry_errs(by["undecided"], self._agreed_m)
         named: tuple[tuple[list[Contradiction], _Cause], ...] = (
             (by["images"], _odometry_errs(by["images"], self._agreed_m)),
             (repeats, ("scene_repeats", {})),
             (bodies, _body_moves(bodies)),
-            (by["undecided"], ("witnesses_undecided", {})),
-            (by["jumps"], ("images_out_of_order", {})),
+            (by["undecided"], ("witnesses_undecided", {"errs": errs, **values})),
         )
-        return tuple(
+        jumps = sorted({*self.disordered, *(one.number for one in by["jumps"])})
+        out = [Remark("images_out_of_order", tuple(jumps))] if jumps else []
+        if longer := self._longer:
+            out.append(Remark("scale_doubted", values={"ratio": 1.0 / (1.0 + longer)}))
+        out += (
             Remark(code, tuple(one.number for one in frames), values)
             for frames, (code, values) in named
             if len(frames) >= _NAMED
         )
+        return tuple(out)
 
 
-def to_and_fro(frames: Sequence[Contradiction]) -> bool:
-    """Whether images jump to and fro, twice at least, while odometry goes on evenly."""
-    ways = [(one.by_images, one.by_odometry) for one in frames if not one.repeats]
-    seen, given = np.array(ways).reshape(-1, 2, 3).swapaxes(0, 1)
-    off, uneven = seen - given, np.linalg.norm(np.diff([seen, given], axis=1), axis=2)
-    back = (off[1:] * off[:-1]).sum(axis=1) < 0.0
-    return int((back & (uneven[0] > _UNEVEN * uneven[1])).sum()) >= _JUMPS
+def in_order(shown: Sequence[Shown]) -> list[Shown]:
+    """The frames, each with the image that fits its motion: where all do so, and else not.
+
+    The motion is the odometry's; where none was measured, that of the sorted images stays. Both
+    err by what was known before the first of them: later ones are as uncertain as they are odd.
+    """
+    odd = [_squared(a.wTc @ b.motion, b.wTc, b.covariance) > _GATE for a, b in pairwise(shown)]
+    if sum(odd) < _JUMPS:
+        return [*shown]
+    at = max(odd.index(True) + 1 - _JUMPS, 1)  # what came before its time may have passed the gate
+    out, rest, first, motion = [*shown[:at]], [*shown[at:]], shown[at], shown[at].motion
+    way = reduce(np.matmul, [one.motion for one in rest]) if first.measured else motion
+    if _squared(np.eye(4), way, first.covariance) < _GATE:  # at rest no order is seen
+        return [*shown]
+    for frame in shown[at:]:
+        motion = frame.motion if frame.measured else motion
+        expected = out[-1].wTc @ motion
+        off = [_squared(expected, one.wTc, first.covariance) for one in rest]
+        if min(off) > _GATE:
+            return [*shown]
+        out.append(replace(frame, wTc=rest.pop(int(np.argmin(off))).wTc))
+        motion = inverse(out[-2].wTc) @ out[-1].wTc
+    return out
+
+
+def _squared(expected: FloatArray, wTc: FloatArray, noise: FloatArray) -> float:
+    """Chi-square of how far a pose (4, 4) is from where it was expected."""
+    off = se3_log(inverse(expected) @ wTc)
+    return float(off @ np.linalg.solve(noise, off))
 
 
 def has_moved(step: Odometry | None) -> bool:
     """Whether measured odometry contradicts that the robot stands."""
     if step is None or not step.measured:
         return False
-    way = se3_log(step.motion)
-    return bool(way @ np.linalg.solve(step.covariance + _EXACT, way) > _GATE)
+    return _squared(np.eye(4), step.motion, step.covariance + _EXACT) > _GATE
+
+
+def _by_factor(seen: FloatArray, given: FloatArray) -> float:
+    """Log odds that motions (n, 3) are others turned and times a factor, of better explanations.
+
+    That what is seen passes with a constant velocity, the difference of both is fixed; or that it
+    is carried along, and the images show no motion.
+    """
+    u, size, v = np.linalg.svd(seen.T @ given)  # orthogonal Procrustes (Schoenemann 1966)
+    alike = size.sum() / max(float((given**2).sum()), 1e-12) * given @ (u @ v).T
+    noise = (0.01 * float(np.abs(seen).max()) + 0.001) ** 2
+    factor = float(np.mean((seen - alike) ** 2))
+    other = min(float(np.var(seen - given, axis=0).mean()), float(np.mean(seen**2)))
+    return 0.5 * len(seen) * math.log((other + noise) / (factor + noise)) - _SLACK
 
 
 _Cause: TypeAlias = tuple[str, dict[str, float | str]]
@@ -572,25 +662,41 @@ _Cause: TypeAlias = tuple[str, dict[str, float | str]]
 
 
 def _odometry_errs(frames: Sequence[Contradiction], agreed_m: float) -> _Cause:
-    """How odometry errs where images are right: by a factor, not at all moving, or by slipping.
+    """How odometry errs where images are right: by a factor, into a direction, or by slipping.
 
     A wrong factor stays: what agrees again, over some way, has slipped.
     """
     if not frames:
         return "", {}
-    seen = np.array([one.by_images for one in frames])
-    given = np.array([one.by_odometry for one in frames])
-    ratios = (seen * given).sum(axis=1) / np.maximum((seen * seen).sum(axis=1), 1e-12)
-    ratio = float(np.median(ratios))
-    scatter = 1.4826 * float(np.median(np.abs(ratios - ratio)))
-    if scatter > _STEADY * max(abs(ratio), 1.0):
-        return "odometry_slips", {}
-    if abs(ratio) < _STUCK:
+    turns, ways = np.median([one.misfit for one in frames], axis=0)
+    kind = _TURN_AND_WAY[0 if turns > ways else 1]
+    seen, given = (np.array([getattr(one, name)[kind] for one in frames]) for name in _WITNESSES)
+    lengths = np.maximum(np.linalg.norm([seen, given], axis=2), 1e-12)
+    (length, _), (angle, strays), (ratio, scatter) = map(
+        _typical,
+        (
+            lengths[1] / lengths[0],
+            np.arccos(np.clip((seen * given).sum(axis=1) / lengths.prod(axis=0), -1.0, 1.0)),
+            (seen * given).sum(axis=1) / lengths[0] ** 2,
+        ),
+    )
+    if turns <= ways and length < _STUCK:
         return "odometry_stuck", {}
-    if ratio > 0.0 and agreed_m > _ENDS * float(np.median(np.linalg.norm(seen, axis=1))):
+    if scatter > _STEADY * max(abs(ratio), 1.0) or min(angle, np.pi - angle) > 3.0 * _STEADY:
+        code = "odometry_turned" if strays < _STEADY < angle / 3.0 else "odometry_slips"
+        return code, {"degrees": math.degrees(angle)}
+    if turns > ways:
+        return "odometry_turns", {"ratio": ratio, "scatter": scatter}
+    if ratio > 0.0 and agreed_m > _ENDS * float(np.median(lengths[0])):
         return "odometry_slips", {}
     code = "odometry_reversed" if ratio < 0.0 else "odometry_scaled"
     return code, {"ratio": ratio, "scatter": scatter}
+
+
+def _typical(values: FloatArray) -> tuple[float, float]:
+    """Median of values (n,), and their robust standard deviation."""
+    centre = float(np.median(values))
+    return centre, 1.4826 * float(np.median(np.abs(values - centre)))
 
 
 def _body_moves(frames: Sequence[Contradiction]) -> _Cause:
@@ -619,6 +725,12 @@ def _mixture(others: Iterable[tuple[float, FloatArray]]) -> FloatArray:
         off = np.array([se3_log(one) for one in motions]).reshape(-1, 6)
         total = total + odds * off[:, :, None] * off[:, None, :]
     return total
+
+
+def _doubted(tracked: Tracked) -> Tracked:
+    """The frame, as one whose images something contradicts."""
+    found = replace(tracked.ego_motion, status=EgoMotionStatus.CONTRADICTED)
+    return replace(tracked, ego_motion=found)
 
 
 def _beginning_none(tracked: Tracked, features: IntArray) -> Tracked:
@@ -719,7 +831,8 @@ class Contradiction:
         number: in its recording.
         episode: that it belongs to.
         verdict: what was followed.
-        by_images, by_odometry: (3,) way since the last frame, in the world's axes, metres.
+        by_images, by_odometry: (6,) turn and way since the last frame, radians and metres.
+        misfit: (2,) chi-square of how far turns, and ways, are apart.
         view: (3,) what only the images' pose explains: columns between which it is seen, as shares
             of the width; share of the matches.
         fits: matches that speak for odometry alone.
@@ -732,9 +845,29 @@ class Contradiction:
     verdict: Verdict
     by_images: FloatArray
     by_odometry: FloatArray
+    misfit: FloatArray
     view: FloatArray
     fits: int
     repeats: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """Where the images have a frame, in any order of them.
+
+    Attributes:
+        number: of the frame in its recording.
+        measured: its motion is odometry's; else that of a constant velocity.
+        wTc: (4, 4) pose by the images.
+        motion: (4, 4) expected since the last frame.
+        covariance: (6, 6) of how far the pose may be off from there.
+    """
+
+    number: int
+    measured: bool
+    wTc: FloatArray
+    motion: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

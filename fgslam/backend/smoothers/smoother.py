@@ -25,7 +25,6 @@ from fgslam.backend.filters.kalman import LandmarkKalman, motions_by_lag
 from fgslam.backend.loops import (
     CLOSURE_FACTOR,
     Constraint,
-    starts_new_part,
     with_unknown_step,
 )
 from fgslam.backend.persistence import learn_from
@@ -164,8 +163,8 @@ class Smoother:
         moved = admission.contradicted(self._held(matched.select(outliers)), tracking.wTc)
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
-        if starts_new_part(increment, tracking):  # what matched agrees on no pose: chance would
-            used[:] = False
+        if not tracking.status.measured:  # what matched agrees on no pose: chance would
+            used &= ~increment.rejected[~observed.is_new]
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame, step = len(self.inputs) - 1, increment.odometry
         turn, measured = Turn.of((step,)), increment.measured

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.lenses import Calibration, RawCamera
-from fgslam.cameras.rig import read_calibration_file
+from fgslam.cameras.rig import implausible, read_calibration_file
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.sensors import CameraRig
 from fgslam.runs.calibrating import convert_calibration, read_calibration, show_calibration
 
 SIZE = (64, 48)
@@ -150,6 +151,17 @@ def test_wrong_options(asked: dict[str, object], words: str, tmp_path: Path) -> 
     write_calibration(calibration(), tmp_path / "a.json")
     with pytest.raises(FgslamError, match=words):
         show_calibration(read_calibration(tmp_path / "a.json", **asked), None)  # type: ignore[arg-type]
+
+
+def test_numbers_of_another_resolution_are_noticed() -> None:
+    size, half = (640, 480), np.array([160.0, 120.0])
+    for (cx, cy), said in ((half, 1), (2.0 * half, 0), (half * (2.0, 1.0), 0)):
+        rig = CameraRig(*size, 300.0, 300.0, cx, cy, 0.1, None, np.eye(4))
+        assert len(implausible("a.json", rig)) == said
+    assert (
+        "the middle of images 0.50 times as large as these"
+        in implausible("a.json", CameraRig(*size, 300.0, 300.0, *half, 0.1, None, np.eye(4)))[0]
+    )
 
 
 def test_millimetres_are_noticed_and_mended(tmp_path: Path) -> None:

@@ -161,6 +161,16 @@ def test_one_repeated_image_costs_one_frame(lab: tuple[CameraRig, list[Images]])
     assert reported[BEGINS] == "the left camera delivers the image of the frame before once more"
 
 
+def test_doubled_frames_are_reported_and_a_standing_robot_is_not(
+    lab: tuple[CameraRig, list[Images]],
+) -> None:
+    rig, images = lab
+    for order, codes in (([0, 0, 1, 1, 2, 2], ["images_doubled"]), ([0, 1, 1, 1, 1, 2], [])):
+        watch = CameraWatch(rig)
+        assert [watch.look(images[k]) for k in order] == [""] * len(order)
+        assert [one.code for one in watch.remarks()] == codes
+
+
 def test_a_camera_that_has_recovered_is_used_again(lab: tuple[CameraRig, list[Images]]) -> None:
     reported, _ = watched(*lab, late(2), until=BEGINS + 5)
     assert any(reported)

@@ -73,6 +73,19 @@ def test_images_without_stereo_matches_give_one_line(
     assert re.search(words, remark), remark
 
 
+def test_a_camera_that_is_mirrored_on_the_way_is_reported(recording: fg.Recording) -> None:
+    """From the second frame on the left image is matched by chance alone."""
+    seen = 0
+
+    def change(images: Images) -> Images:
+        nonlocal seen
+        seen += 1
+        return images[:2] if seen == 1 else (images[0], images[1][::-1, ::-1].copy())
+
+    said = remarks(recording, change, cameras=2)
+    assert any(one.startswith("right and left image have next to nothing in") for one in said), said
+
+
 def test_a_covered_camera_of_two_is_not_taken_for_swapped(
     recording: fg.Recording,
 ) -> None:

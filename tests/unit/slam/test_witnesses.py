@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_witnesses_that_agree_leave_the_drive_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("reported", "code"),
     [
-        (lambda k, step: (10.0 if k >= BEGINS else 1.0) * step, "odometry_scaled"),
+        (lambda k, step: 100.0 * step, "odometry_scaled"),
         (lambda k, step: 0.0 if k >= BEGINS else step, "odometry_stuck"),
         (lambda k, step: -step if k >= BEGINS else step, "odometry_reversed"),
         (lambda k, step: step + 0.3 * (k % 3) if k >= BEGINS else step, "odometry_slips"),
@@ -111,6 +112,46 @@ def test_images_out_of_order_are_named_and_do_no_harm(order: dict[int, int]) -> 
         (note,) = (one for one in found.notes if not isinstance(one, str))
         assert set(note.frames) <= set(range(min(order), max(order) + 2))
         assert error_m(found) < 0.02
+
+
+def test_images_out_of_order_are_named_without_odometry() -> None:
+    """A velocity that stays explains them in another order; real steps back explain none."""
+    order = {7: 8, 8: 7}
+    for moved, named in (
+        (lambda k: 0.05 * order.get(k, k), [7, 8]),
+        (lambda k: 0.05 * min(k, 8) - 0.05 * max(k - 8, 0), []),  # turns back
+        (lambda k: 0.05 * k + 0.03 * (k % 2) * (k > 6), []),  # shakes
+    ):
+        with Session(PASSING_RIG, KIND) as session:
+            for k in range(11):
+                session.track(0.1 * k, pair_of(list(SCENE), moved(k), 0.0))
+            assert session.pipeline.witnesses.disordered == named
+
+
+def test_odometry_of_other_axes_is_named() -> None:
+    with Session(PASSING_RIG, KIND) as session:
+        for k in range(FRAMES):
+            motion = pose(np.eye(3), np.array([0.0, 0.0, way(k) - way(k - 1)]))
+            images = pair_of(list(SCENE), way(k), 0.0)
+            session.track(0.1 * k, images, Odometry(motion, NOISE) if k else None)
+        found = session.result()
+    assert codes(found) == ["odometry_turned"]
+    assert error_m(found) < 0.02
+
+
+def test_scales_that_differ_by_less_than_a_frame_shows_are_both_held() -> None:
+    """A baseline stated 1.2 times too long: no frame contradicts odometry, all together do."""
+    rig = replace(PASSING_RIG, baseline=1.2 * PASSING_RIG.baseline)
+    with Session(rig, KIND) as session:
+        for k in range(FRAMES):
+            step = Odometry(pose(np.eye(3), np.array([way(k) - way(k - 1), 0.0, 0.0])), 4.0 * NOISE)
+            session.track(0.1 * k, pair_of(list(SCENE), way(k), 0.0), step if k else None)
+        found = session.result()
+    assert codes(found) == ["scale_doubted"]
+    off = error_m(found)
+    assert off > 0.08
+    assert off < 3.0 * np.sqrt(np.trace(found.covariances[-1][3:, 3:]))
+    assert off < 3.0 * np.sqrt(np.trace(found.online_covariances[-1][3:, 3:]))
 
 
 def test_odometry_that_jumps_to_and_fro_is_no_fault_of_the_images() -> None:

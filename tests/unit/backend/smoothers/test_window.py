@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from simulated import RIG, play
-from smoothing import FREE, build, drawn
+from smoothing import FREE, SMOOTHERS, answer, blackout, build, drawn
 
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings
@@ -222,3 +222,18 @@ def test_of_what_is_near_the_observation_alone_places_it() -> None:
     seen = SeenAgain.of(RIG, known, np.tile(WTF, (3, 1, 1)), measured, noise)
     assert (seen.variables.tolist(), seen.near.tolist()) == ([5, 7], [True, False])
     np.testing.assert_allclose(seen.points, known.points[:2], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["isam2, every frame", "sliding_window"])
+def test_matches_that_agree_on_no_pose_move_none(kind: str) -> None:
+    """Of a frame in the dark three are left by chance, and were rejected when it was driven."""
+    increments = drawn(4).increments
+    unseen = blackout(increments, range(8, 9))
+    few = np.flatnonzero(~increments[8].observations.is_new)[:3]
+    observed = increments[8].observations.select(few)
+    observed = dataclasses.replace(observed, measurement=observed.measurement + 3.0 * np.eye(3)[0])
+    chance = dataclasses.replace(unseen[8], observations=observed, rejected=np.ones(3, np.bool_))
+    wrong = answer(SMOOTHERS[kind], [*unseen[:8], chance, *unseen[9:]])
+    right = answer(SMOOTHERS[kind], unseen)
+    off = wrong.trajectory.poses - right.trajectory.poses
+    np.testing.assert_allclose(off, 0.0, rtol=0.0, atol=1e-6)  # what the solver leaves
