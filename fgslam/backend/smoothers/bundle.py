@@ -509,7 +509,7 @@ def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
 
 PLAIN = KernelSettings("none")
 _FAR = 0.3  # of the cost: a step that gains as much has made another system of a kept one
-_AT_ONCE = 20_000  # observations, of which each takes some kilobytes
+_AT_ONCE = 4_000  # observations, of which each takes some kilobytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
