@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, Float32, FloatArray, IntArray
 from fgslam.core.geometry import wrap
+from fgslam.core.kernels import Kernel
 from fgslam.core.types import Words
 from fgslam.frontend.settings import AppearanceSettings
 
@@ -33,11 +36,16 @@ def pairs_within(
     order = np.argsort(values, kind="stable")
     ordered = values[order]
     first = np.searchsorted(ordered, center - reach, side="left")
-    counts = np.searchsorted(ordered, center + reach, side="right") - first
-    i = np.repeat(np.arange(len(center)), counts)
-    starts = np.cumsum(counts) - counts
-    j = np.arange(len(i)) - np.repeat(starts - first, counts)
+    last = np.searchsorted(ordered, center + reach, side="right")
+    i, j = _every(first, last)
     return i, order[j]
+
+
+def _every(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
+    """All pairs (k,) of i and the numbers from first[i] up to last[i] (n,)."""
+    counts = last - first
+    i = np.repeat(np.arange(len(counts)), counts)
+    return i, np.arange(len(i)) - np.repeat(np.cumsum(counts) - last, counts)
 
 
 def alike(
@@ -52,6 +60,65 @@ def alike(
     turned = wrap(orientation[0][close] - orientation[1][close])
     close[close] = np.abs(turned) <= max_angle
     return np.asarray(close)
+
+
+def _pairs_in_gates(
+    first: Any,
+    last: Any,
+    wanted: Any,
+    seen: Any,
+    ratio: float,
+    angle: float,
+    found: Any,
+    count: Any,
+) -> None:
+    k = 0
+    for i in range(len(wanted)):
+        w = wanted[i]
+        for j in range(first[i], last[i]):
+            s = seen[j]
+            near = (abs(s[0] - w[0]) <= w[2]) & ((abs(s[1] - w[1]) <= w[3]) | (s[4] > 0.0))
+            if not near & (w[4] <= s[2] * ratio) & (s[2] <= w[4] * ratio):
+                continue
+            turned = (w[5] - s[3]) / (2.0 * math.pi)
+            if 2.0 * math.pi * abs(turned - np.floor(turned + 0.5)) <= angle:
+                if k < found.shape[1]:
+                    found[0, k], found[1, k] = i, j
+                k += 1
+    count[0] = k
+
+
+def _pairs_in_gates_numpy(
+    first: IntArray,
+    last: IntArray,
+    wanted: FloatArray,
+    seen: FloatArray,
+    ratio: float,
+    angle: float,
+    found: IntArray,
+    count: IntArray,
+) -> None:
+    i, j = _every(first, last)
+    w, s = wanted[i], seen[j]
+    near = np.abs(s[:, 0] - w[:, 0]) <= w[:, 2]
+    near &= (np.abs(s[:, 1] - w[:, 1]) <= w[:, 3]) | (s[:, 4] > 0.0)
+    near &= alike((w[:, 4], s[:, 2]), (w[:, 5], s[:, 3]), ratio, angle)
+    count[0] = near.sum()
+    fits = min(count[0], found.shape[1])
+    found[:, :fits] = np.stack([i, j])[:, near][:, :fits]
+
+
+pairs_in_gates = Kernel(
+    _pairs_in_gates,
+    _pairs_in_gates_numpy,
+    "i8[::1] i8[::1] f8[:,::1] f8[:,::1] f8 f8 i8[:,::1] i8[::1]",
+)
+"""(first (n,), last (n,), wanted (n, 6), seen (m, 5), ratio of scales, angle, found, count (1,)):
+pairs i, j with first[i] <= j < last[i] that agree in row, disparity, scale and orientation.
+
+``wanted``: row, disparity, how far both may be off, scale, orientation; ``seen``: row, disparity,
+scale, orientation, above 0 where no disparity was measured. Of ``found`` (2, k) as many as it has
+room for."""
 
 
 def resembling(

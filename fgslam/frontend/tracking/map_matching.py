@@ -17,7 +17,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig, measures_one_image
 from fgslam.core.types import Prediction, StereoFeatures
-from fgslam.frontend.features.matching import alike, pairs_within, pick, resembling
+from fgslam.frontend.features.matching import pairs_in_gates, pick, resembling
 from fgslam.frontend.settings import AppearanceSettings, DatabaseSettings, MapMatchingSettings
 
 Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
@@ -34,7 +34,7 @@ _DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise
 MAX_WINDOW_PX = 80.0
 """Side that widening may not exceed, also of the disparity gate: a quarter of 320 px, beyond
 which most candidates are of other landmarks."""
-_ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
+_ORIENTATION = np.deg2rad(20.0)  # largest difference to the predicted one, as between images
 
 
 class MapMatcher:
@@ -75,24 +75,22 @@ class MapMatcher:
         self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
     ) -> MapMatches:
         # Images are wide: the column leaves the fewest pairs to the others.
-        there, seen, far = (
-            np.ascontiguousarray(one.T)
-            for one in (expected.measurement, features.measurement, reach)
-        )
-        i, j = pairs_within(there[0], far[0], seen[0])
-        for axis in (1, 2, 0):
-            near = np.abs(seen[axis].take(j) - there[axis].take(i)) <= far[axis].take(i)
-            if axis == 2:
-                near |= measures_one_image(features.measurement_covariance)[j]
-            i, j = i[near], j[near]
-        same = alike(
-            (expected.scale[i], features.scale[j]),
-            (expected.orientation[i], features.orientation[j]),
-            _SCALE_RATIO,
-            np.deg2rad(_ORIENTATION_DEG),
-        )
+        order = np.argsort(features.measurement[:, 0], kind="stable")
+        columns, (center, half) = features.measurement[order, 0], (expected.measurement, reach)
+        first = np.searchsorted(columns, center[:, 0] - half[:, 0], side="left")
+        last = np.searchsorted(columns, center[:, 0] + half[:, 0], side="right")
+        looks = expected.scale, expected.orientation
+        wanted = np.column_stack([center[:, 1:], half[:, 1:], *looks])
+        of_one = measures_one_image(features.measurement_covariance)
+        seen = (features.measurement[:, 1:], features.scale, features.orientation, of_one)
+        gates = first, last, wanted, np.column_stack(seen)[order], _SCALE_RATIO, _ORIENTATION
+        count, found = np.array([len(order)]), np.empty((2, 0), np.int64)
+        while found.shape[1] < count[0]:  # once more, if there are more than features
+            found = np.empty((2, count[0]), np.int64)
+            pairs_in_gates(*gates, found, count)
+        i, j = found[0, : count[0]], order[found[1, : count[0]]]
         descriptors = (expected.descriptors, features.descriptors)
-        pairs = resembling(i[same], j[same], descriptors, self._appearance)
+        pairs = resembling(i, j, descriptors, self._appearance)
         had_candidates = np.zeros(len(features), np.bool_)
         had_candidates[pairs[1]] = True
         if features.complete is None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from known_places import blurred, random_descriptors
 
 from fgslam.core.arrays import ByteArray
 from fgslam.frontend.features import matching as descriptor_index
-from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
+from fgslam.frontend.features.matching import AppearanceIndex, Neighbours, pairs_in_gates
 from fgslam.frontend.tracking import landmarks as views_module
 from fgslam.frontend.tracking.landmarks import ViewPool, Views
 
@@ -145,3 +147,35 @@ def test_a_view_is_quantised_to_words_once(
     pool.find_words()
     assert np.array_equal(pool.words(more[:, 0]), descriptor_index.words_of(first))
     assert asked[5:] == [100, 0, 0]
+
+
+@pytest.mark.parametrize("find", [pairs_in_gates, pairs_in_gates.numpy], ids=["kernel", "numpy"])
+def test_pairs_in_gates_are_those_of_every_pair_asked_one_by_one(
+    find: object, rng: np.random.Generator
+) -> None:
+    n, m, ratio, angle = 30, 40, 1.5, 0.6
+    first = rng.integers(0, m, n)
+    last = np.minimum(first + rng.integers(0, 20, n), m)
+    looks = rng.uniform(1.0, 2.0, n), rng.uniform(-9.0, 9.0, n)
+    wanted = np.column_stack(
+        [*rng.uniform(0.0, 9.0, (2, n)), *rng.uniform(2.0, 6.0, (2, n)), *looks]
+    )
+    looks = rng.uniform(1.0, 2.0, m), rng.uniform(-9.0, 9.0, m), rng.uniform(size=m) < 0.3
+    seen = np.column_stack([*rng.uniform(0.0, 9.0, (2, m)), *looks])
+    wanted[0, 5] = seen[-1, 3] = math.nan
+    expected = []
+    for i, w in enumerate(wanted):
+        for j in range(first[i], last[i]):
+            s = seen[j]
+            near = abs(w[0] - s[0]) <= w[2] and (abs(w[1] - s[1]) <= w[3] or s[4] == 1.0)
+            same_size = max(w[4] / s[2], s[2] / w[4]) <= ratio
+            turned = w[5] - s[3]
+            alike = math.isfinite(turned) and math.cos(turned) >= math.cos(angle)
+            if near and same_size and alike:
+                expected.append((i, j))
+    assert len(expected) > 10
+    for room in (len(expected) + 3, 5):
+        found, count = np.zeros((2, room), np.int64), np.zeros(1, np.int64)
+        find(first, last, wanted, seen, ratio, angle, found, count)  # type: ignore[operator]
+        assert count[0] == len(expected)
+        assert found.T[: count[0]].tolist() == [list(pair) for pair in expected[:room]]
