@@ -80,8 +80,8 @@ def _pairs_in_gates(
             near = (abs(s[0] - w[0]) <= w[2]) & ((abs(s[1] - w[1]) <= w[3]) | (s[4] > 0.0))
             if not near & (w[4] <= s[2] * ratio) & (s[2] <= w[4] * ratio):
                 continue
-            turned = (w[5] - s[3]) / (2.0 * math.pi)
-            if 2.0 * math.pi * abs(turned - np.floor(turned + 0.5)) <= angle:
+            turns = (w[5] - s[3]) / (2.0 * math.pi)
+            if 2.0 * math.pi * abs(turns - np.floor(turns + 0.5)) <= angle:
                 if k < found.shape[1]:
                     found[0, k], found[1, k] = i, j
                 k += 1
@@ -89,15 +89,9 @@ def _pairs_in_gates(
 
 
 def _pairs_in_gates_numpy(
-    first: IntArray,
-    last: IntArray,
-    wanted: FloatArray,
-    seen: FloatArray,
-    ratio: float,
-    angle: float,
-    found: IntArray,
-    count: IntArray,
-) -> None:
+    first: IntArray, last: IntArray, wanted: FloatArray, seen: FloatArray, ratio: float,
+    angle: float, found: IntArray, count: IntArray,
+) -> None:  # fmt: skip
     i, j = _every(first, last)
     w, s = wanted[i], seen[j]
     near = np.abs(s[:, 0] - w[:, 0]) <= w[:, 2]
@@ -108,11 +102,8 @@ def _pairs_in_gates_numpy(
     found[:, :fits] = np.stack([i, j])[:, near][:, :fits]
 
 
-pairs_in_gates = Kernel(
-    _pairs_in_gates,
-    _pairs_in_gates_numpy,
-    "i8[::1] i8[::1] f8[:,::1] f8[:,::1] f8 f8 i8[:,::1] i8[::1]",
-)
+_KINDS = "i8[::1] i8[::1] f8[:,::1] f8[:,::1] f8 f8 i8[:,::1] i8[::1]"
+pairs_in_gates = Kernel(_pairs_in_gates, _pairs_in_gates_numpy, _KINDS)
 """(first (n,), last (n,), wanted (n, 6), seen (m, 5), ratio of scales, angle, found, count (1,)):
 pairs i, j with first[i] <= j < last[i] that agree in row, disparity, scale and orientation.
 
