@@ -79,8 +79,8 @@ class MapMatcher:
         columns, (center, half) = features.measurement[order, 0], (expected.measurement, reach)
         first = np.searchsorted(columns, center[:, 0] - half[:, 0], side="left")
         last = np.searchsorted(columns, center[:, 0] + half[:, 0], side="right")
-        looks = expected.scale, expected.orientation
-        wanted = np.column_stack([center[:, 1:], half[:, 1:], *looks])
+        seen_as = expected.scale, expected.orientation
+        wanted = np.column_stack([center[:, 1:], half[:, 1:], *seen_as])
         of_one = measures_one_image(features.measurement_covariance)
         seen = (features.measurement[:, 1:], features.scale, features.orientation, of_one)
         gates = first, last, wanted, np.column_stack(seen)[order], _SCALE_RATIO, _ORIENTATION
