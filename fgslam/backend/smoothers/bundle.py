@@ -509,7 +509,8 @@ def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
 
 PLAIN = KernelSettings("none")
 _FAR = 0.3  # of the cost: a step that gains as much has made another system of a kept one
-_AT_ONCE = 4_000  # observations, of which each takes some kilobytes
+_AT_ONCE = 20_000  # observations, of which each takes some kilobytes
+_PARTS = 5  # at least, of a drive's: memory that is used again is faster than new
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -670,13 +671,15 @@ class WholeGraph:
         Returns:
             Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
         """
-        seen = self.seen
-        rows, parts = seen.look(state.poses, state.points), []
-        for few in np.array_split(np.arange(len(seen)), len(seen) // _AT_ONCE + 1):
+        seen, rows = self.seen, self.seen.look(state.poses, state.points)
+
+        def of(few: IntArray) -> FloatArray:
             by = -seen.roots[few] @ shifts(seen.measured[few])
             incidence = (self._incidence[0][:, few], self._incidence[1][:, few])
-            parts.append(_pulled(rows.select(few), by, self.weights[few], incidence))
-        found = reduce(np.add, parts)
+            return _pulled(rows.select(few), by, self.weights[few], incidence)
+
+        parts = max(_PARTS, len(seen) // _AT_ONCE + 1)
+        found = reduce(np.add, map(of, np.array_split(np.arange(len(seen)), parts)))
         p = found.shape[1]
         return found[:-p], found[-p:]
 
