@@ -475,10 +475,10 @@ _ERRS = {
     "odometry_slips": "images show other ways, by no factor that stays (the wheels slip, its "
     "clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
     "odometry_stuck": "it states no motion while images show one",
-    "odometry_turned": "its motions are {degrees:.0f} degrees off the direction in which images "
+    "odometry_turned": "its ways are {degrees:.0f} degrees off the direction in which images "
     "show them (the axes of its frame, or dataset.camera_yaw_deg)",
     "odometry_turns": "its turns are {ratio:.2f} +- {scatter:.2f} of those that images show "
-    "(degrees or radians, or the sign of the yaw)",
+    "(degrees or radians, the sign of the yaw, or wheels that slip in turns)",
 }
 """How odometry errs, by the code of a remark on it."""
 _PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "

@@ -348,8 +348,14 @@ class Witnesses:
         return _squared(self._tracker.constrained(chain).wTc, pose.wTc, noise) > _GATE
 
     def _rejoined(self, frame: Frame, pose: EgoMotion, chain: Prediction) -> bool:
-        """Whether what the images show, after frames that followed them, is odometry's chain."""
+        """Whether what the images show, after frames that followed them, is odometry's chain.
+
+        Nothing comes back to a chain so uncertain that the images never left it.
+        """
         if self._other is None or not pose.status.measured or self._off(frame, chain, pose):
+            return False
+        last = replace(pose, wTc=frame.prediction.wTc @ inverse(frame.step.motion))
+        if not self._off(frame, chain, last):
             return False
         return self._squared(frame.step, frame.prediction, pose) > _GATE
 
@@ -417,7 +423,7 @@ class Witnesses:
         noise = self._noise(step, pose)
         here = Shown(increment.index, step.measured, pose.wTc, step.motion, noise)
         self._shown = [*self._shown, here][-_RATIOS:]
-        if len(self._shown) > 1 and step.measured:
+        if len(self._shown) > 1 and step.measured and self._other is None:
             expected = self._shown[-2].wTc @ step.motion
             if _squared(expected, pose.wTc, noise) < _GATE:
                 way = np.append(np.zeros(3), step.motion[:3, 3])
@@ -680,13 +686,13 @@ def _odometry_errs(frames: Sequence[Contradiction], agreed_m: float) -> _Cause:
             (seen * given).sum(axis=1) / lengths[0] ** 2,
         ),
     )
-    if turns <= ways and length < _STUCK:
+    if turns > ways:
+        return "odometry_turns", {"ratio": ratio, "scatter": scatter}
+    if length < _STUCK:
         return "odometry_stuck", {}
     if scatter > _STEADY * max(abs(ratio), 1.0) or min(angle, np.pi - angle) > 3.0 * _STEADY:
         code = "odometry_turned" if strays < _STEADY < angle / 3.0 else "odometry_slips"
         return code, {"degrees": math.degrees(angle)}
-    if turns > ways:
-        return "odometry_turns", {"ratio": ratio, "scatter": scatter}
     if ratio > 0.0 and agreed_m > _ENDS * float(np.median(lengths[0])):
         return "odometry_slips", {}
     code = "odometry_reversed" if ratio < 0.0 else "odometry_scaled"

@@ -41,7 +41,7 @@ def test_one_frame_and_words_are_said_as_they_are() -> None:
     assert sentence(Remark("bridged", (20,))).startswith("frame 20: not located")
     undecided = {"errs": "odometry_turned", "degrees": 90.0}
     said = sentence(Remark("witnesses_undecided", (20, 21), undecided))
-    assert "holds both; if the odometry errs, its motions are 90 degrees off" in said
+    assert "holds both; if the odometry errs, its ways are 90 degrees off" in said
     fault = Remark("camera_fault", (20,), {"fault": "the left camera sleeps", "all": 9})
     assert sentence(fault).startswith("the left camera sleeps: 1 of 9 frames, frame 20, are not")
     assert sentence("in words") == "in words"
