@@ -470,7 +470,6 @@ class Witnesses:
         share = len(columns) / max(len(columns) + len(odometry.ids), 1)
         self.found.append(
             Contradiction(
-                row=self._rows,
                 number=frame.number,
                 episode=len(self.score) - 1,
                 verdict=verdict,
@@ -833,7 +832,6 @@ class Contradiction:
     """One frame whose witnesses contradict each other.
 
     Attributes:
-        row: of the frame among all.
         number: in its recording.
         episode: that it belongs to.
         verdict: what was followed.
@@ -845,7 +843,6 @@ class Contradiction:
         repeats: what the images' pose explains resembles other places of the same image.
     """
 
-    row: int
     number: int
     episode: int
     verdict: Verdict
