@@ -25,8 +25,8 @@ class SiftSettings:
     )
     contrast: Literal["relative", "absolute"] = Field(
         default="relative",
-        description="`relative`: the threshold falls with an image's contrast, down to its noise; "
-        "a noisy image is smoothed",
+        description="`relative`: the threshold falls with an image's contrast, and where features "
+        "are few, down to its noise; a noisy image is smoothed",
     )
     base_sigma_px: float = Field(
         default=1.6, gt=0.5, le=3.0, description="Gaussian of the first level, doubled image"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -16,7 +15,7 @@ from scipy.linalg import hadamard
 
 from fgslam.core.arrays import ByteArray, Float32, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
-from fgslam.core.types import Features
+from fgslam.core.types import PATCH_PX, Features
 from fgslam.frontend.settings import Appearance, SiftSettings
 
 SCALE_LEVELS = 8  # searched, finest first, as in the paper
@@ -28,6 +27,11 @@ _NOISE_ANSWER = 0.4
 Found on noise, base sigma 1.6 and two levels an octave; it is smaller for others, and falls with
 the scale."""
 _WHITE = 255.0
+_NOISE_CONTRAST = OCTAVE_LAYERS * _NOISE_ANSWER / _WHITE
+"""OpenCV's contrast threshold that such features just pass, in the noise's sigmas."""
+_ENOUGH = 400
+"""Features of an image, or one a patch's area where these are fewer (more would overlap): of links
+between views some tenth is recognised, and a pose by fewer than 40 landmarks is poor."""
 
 
 class SiftExtractor:
@@ -38,39 +42,33 @@ class SiftExtractor:
     """
 
     def __init__(self, settings: SiftSettings, appearance: Appearance) -> None:
-        """Makes the detector; OpenCV's own threads are switched off, images run in parallel."""
+        """OpenCV's own threads are switched off, images run in parallel."""
         cv2.setNumThreads(1)
         self._settings = settings
         self._describe = appearance == "descriptor"
-        self._sift = self._detector(settings.contrast_threshold)
 
     def extract(self, image: Image) -> Features:
         """Features of one grey image (height, width), in OpenCV's order, which is repeatable.
 
         With ``contrast: relative`` those that the image would have if it were well exposed and not
-        too noisy, without what is likely to be noise. One that is so is taken as it is.
+        too noisy, without what is likely to be noise. One that is so is taken as it is. Where they
+        are few, its strongest ones, down to the noise.
         """
-        if self._settings.contrast == "absolute":
-            return self._select(*self._found(self._sift, image), noise=0.0)
-        share, noise = contrast_share(image), noise_sigma(image)
-        image = smoothed(image, noise)
-        if share == 1.0:
-            return self._select(*self._found(self._sift, image), noise=0.0)
-        dim = self._detector(share * self._settings.contrast_threshold)
-        return self._select(*self._found(dim, image), noise)
+        share, noise = 1.0, 0.0
+        if self._settings.contrast == "relative":
+            share, noise = contrast_share(image), noise_sigma(image)
+            image = smoothed(image, noise)
+        threshold, by_noise = share * self._settings.contrast_threshold, noise * (share < 1.0)
+        found = self._found(image, threshold, by_noise, self._settings.max_features)
+        most = min(_ENOUGH, image.size // PATCH_PX**2, self._settings.max_features or _ENOUGH)
+        if len(found) < most and 0.0 < _NOISE_CONTRAST * noise < threshold:
+            found = self._found(image, _NOISE_CONTRAST * noise, noise, most)
+        return found
 
-    def _detector(self, contrast_threshold: float) -> cv2.SIFT:
-        return cv2.SIFT.create(
-            self._settings.max_features,
-            OCTAVE_LAYERS,
-            contrast_threshold,
-            EDGE_THRESHOLD,
-            self._settings.base_sigma_px,
-            cv2.CV_8U,
-            True,
-        )
-
-    def _found(self, sift: cv2.SIFT, image: Image) -> tuple[Many[cv2.KeyPoint], ByteArray]:
+    def _found(self, image: Image, contrast: float, noise: float, most: int) -> Features:
+        """Features of the levels searched that answer more than noise of that sigma would."""
+        blur = self._settings.base_sigma_px
+        sift = cv2.SIFT.create(most, OCTAVE_LAYERS, contrast, EDGE_THRESHOLD, blur, cv2.CV_8U, True)
         # One call for both: two calls would build the pyramid twice.
         if self._describe:
             keypoints, computed = sift.detectAndCompute(image, None)
@@ -78,12 +76,6 @@ class SiftExtractor:
             keypoints, computed = sift.detect(image, None), None
         if computed is None:
             computed = np.zeros((len(keypoints), 128), np.uint8)
-        return keypoints, np.asarray(computed, np.uint8)
-
-    def _select(
-        self, keypoints: Many[cv2.KeyPoint], descriptors: ByteArray, noise: float
-    ) -> Features:
-        """Features of the levels searched that answer more than noise of that sigma would."""
         # Column by column: half the time of one row a key point.
         packed = np.array([kp.octave for kp in keypoints], np.int64)  # octave and layer
         octave = ((packed & 255) ^ 128) - 128  # signed
@@ -96,7 +88,7 @@ class SiftExtractor:
             xy=xy[keep],
             scale=0.5 * np.array([kp.size for kp in keypoints])[keep],
             orientation=np.deg2rad(np.array([kp.angle for kp in keypoints])[keep]),
-            descriptors=descriptors[keep],
+            descriptors=np.asarray(computed, np.uint8)[keep],
         )
 
 

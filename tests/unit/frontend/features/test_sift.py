@@ -192,6 +192,23 @@ def test_a_well_exposed_image_is_taken_as_it_is() -> None:
     assert_same_bits(extract(image), extract(image, contrast="absolute"))
 
 
+def faint(amplitude: float) -> Image:
+    """A wall with hardly any texture between a window and a black cupboard, noise 0.5."""
+    grey = 130.0 + amplitude * (texture() - 128.0) / 52.0
+    grey[:, :16], grey[:, -16:] = 20.0, 235.0
+    return as_image(grey + 0.5 * np.random.default_rng(4).standard_normal(grey.shape))
+
+
+def test_where_features_are_few_the_strongest_are_taken() -> None:
+    image = faint(6.0)
+    plain, found = extract(image, contrast="absolute"), extract(image)
+    assert len(plain) < 100
+    assert 300 < len(found) <= 320 * 240 // 15**2
+    assert nearest(plain.xy, found.xy)[1].max() < 0.1
+    assert len(extract(faint(0.0))) < 15  # the noise is no feature, nor are straight edges
+    assert len(extract(image, max_features=50)) == 50
+
+
 @pytest.mark.parametrize(("grey", "sigma"), [(0.0, 4.0), (20.0, 0.3), (200.0, 1.5)])
 def test_noise_alone_is_hardly_ever_a_feature(grey: float, sigma: float) -> None:
     """Under a lens cap, or before a white wall: 1 in 100 of what the noise alone would give."""
