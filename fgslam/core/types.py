@@ -368,7 +368,7 @@ class Trajectory(Brief):
         expected = "timestamp tx ty tz qx qy qz qw on each line"
         text = read_text(path, remedy=f"check the path; it has {expected}")
         values, lines = parse_rows(path, text, 8, expected)
-        backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
+        backwards = np.concatenate([[False], values[1:, 0] <= values[:-1, 0]])
         for bad, what in (
             (~np.isfinite(values).all(axis=1), "a number is not finite; repair or remove the line"),
             (

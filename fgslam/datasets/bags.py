@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -281,28 +282,31 @@ class Bag:
             except DAMAGED as fault:
                 raise DatasetError(self._unreadable(fault)) from None
 
-    def _decoded(self, connection: Connection, raw: bytes) -> Any:
-        """The message's fields. Raises FrameError where they are damaged."""
+    def _decoded(self, connection: Connection, raw: bytes, make: Callable[[Any], T]) -> T:
+        """What ``make`` makes of the message. Raises FrameError where it is damaged or another."""
+        where = f"a message of {connection.topic} in {self.paths[0]}"
         try:
-            return self._reader.deserialize(raw, connection.msgtype)
+            message = self._reader.deserialize(raw, connection.msgtype)
         except DAMAGED as fault:
-            raise FrameError(
-                f"a message of {connection.topic} in {self.paths[0]} cannot be decoded ({fault}); "
-                f"{LEAVE_OUT}"
-            ) from None
+            raise FrameError(f"{where} cannot be decoded ({fault}); {LEAVE_OUT}") from None
+        try:
+            return make(message)
+        except AttributeError as fault:  # the bag's own definition of the type is not ROS's
+            text = f"{where} is without a field of its type ({fault}); copy the bag again"
+            raise FrameError(text) from None
 
     def first_frame(self, topic: Topic) -> str:
         """The frame in which a topic's first message is stated; empty where it cannot be read."""
         try:
             connection, _, raw = next(self._messages((topic.name,)))
-            return str(self._decoded(connection, raw).header.frame_id)
+            return self._decoded(connection, raw, lambda message: str(message.header.frame_id))
         except (StopIteration, FrameError, DatasetError):
             return ""
 
     def decoded(self, topic: str) -> Iterator[Any]:
         """Every message of a topic. Raises DatasetError at damage, FrameError of a message."""
         for connection, _, raw in self._messages((topic,)):
-            yield self._decoded(connection, raw)
+            yield self._decoded(connection, raw, lambda message: message)
 
     def depth_scale(self, topic: str) -> float | None:
         """Units of depth in a metre by the topic that states metres a unit; None where none does.
@@ -313,7 +317,7 @@ class Bag:
         if not topic:
             return None
         connection, _, raw = next(self._messages((topic,)))
-        metres = float(self._decoded(connection, raw).data)
+        metres = self._decoded(connection, raw, lambda message: float(message.data))
         return round(1.0 / metres, 3) if metres > 0.0 else None
 
     def index(self, chosen: Chosen) -> None:
@@ -327,7 +331,7 @@ class Bag:
             for connection, time, raw in self._messages(topics):
                 topic, stamp = connection.topic, time
                 if topic in chosen.transforms:
-                    transforms = messages.transforms_of(self._decoded(connection, raw))
+                    transforms = self._decoded(connection, raw, messages.transforms_of)
                     self.tree.add(transforms, static=topic.endswith("tf_static"))
                 else:
                     # The header is a message's first field. ROS 1: sequence number, seconds,
@@ -338,17 +342,17 @@ class Bag:
                     )
                     stamp = 1_000_000_000 * seconds + rest
                 if topic == motion or topic not in (*self.frames, *chosen.transforms):
+                    decoded = partial(self._decoded, connection, raw)
                     try:
-                        content = self._decoded(connection, raw)
+                        if topic not in self.frames:
+                            self.frames[topic] = decoded(messages.frame_of)
+                        if topic in chosen.infos:
+                            self.infos[topic] = decoded(messages.calibration_of)
+                        if topic == motion:
+                            moved.append((stamp, decoded(messages.motion_of)))
                     except FrameError:
                         if topic not in chosen.views:  # else one lost frame
                             raise
-                    else:
-                        self.frames.setdefault(topic, messages.frame_of(content))
-                        if topic in chosen.infos:
-                            self.infos[topic] = messages.calibration_of(content)
-                        if topic == motion:
-                            moved.append((stamp, messages.motion_of(content)))
                 rows.append((topic, time, stamp))
         except DatasetError as fault:
             if not rows:
@@ -361,7 +365,8 @@ class Bag:
         for topic in sorted(set(chosen.views)):
             at = np.flatnonzero(of_topic == topic)
             if len(at) == 0:
-                raise DatasetError(f"no message of {topic} can be read; record the bag again")
+                why = "; ".join([f"no message of {topic} can be read", *self.notes])
+                raise DatasetError(f"{why}; record the bag again")
             own = stamps[at]
             if len(at) > 1 and (own == own[0]).all():
                 own = self._times[at]
@@ -409,13 +414,7 @@ class Bag:
                 )
             connection, _, raw = self._kept[place]
         where = f"{self.paths[0]}, {connection.topic}"
-        message = self._decoded(connection, raw)
-        try:
-            return make(message, where)
-        except AttributeError as fault:  # the bag's own definition of the type is not ROS's
-            raise FrameError(
-                f"{where}: message without a field of its type ({fault}); copy the bag again"
-            ) from None
+        return self._decoded(connection, raw, lambda message: make(message, where))
 
     def _go_to(self, place: int) -> None:
         """Walks forward to a message; those of images that are passed are kept for a while."""

@@ -97,6 +97,7 @@ def test_comments_blank_lines_and_windows_line_ends_are_accepted(tmp_path: Path)
         ("2 0 0 0 0 0 0", "7 numbers instead of 8"),
         ("2 0 0 zero 0 0 0 1", "zero"),
         ("2 0 0 nan 0 0 0 1", "not finite"),
+        ("1e999 0 0 0 0 0 0 1\n1e999 0 0 0 0 0 0 1", "not finite"),
         ("2 0 0 0 0 0 0 0", "quaternion"),
         ("1 0 0 0 0 0 0 1", "does not increase"),
     ],

@@ -163,6 +163,14 @@ def test_swapped_names_are_told_by_the_calibration(tmp_path: Path) -> None:
     assert "by their camera_info /cam/left/image_raw is the right camera" in recording.notes[0]
 
 
+def test_a_definition_of_its_own_is_one_line(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.mcap", stereo(2))
+    renamed = path.read_bytes().replace(b"string distortion_model", b"string distortion_motel")
+    path.write_bytes(renamed)
+    with pytest.raises(DatasetError, match="is without a field of its type"):
+        opened(path)
+
+
 def test_one_camera_info_is_not_enough_but_a_file_is(tmp_path: Path) -> None:
     messages = [m for m in stereo(2) if m[0] != "/cam/right/camera_info"]
     path = write_bag(tmp_path / "a.bag", messages)
