@@ -456,7 +456,7 @@ def _odometry_source(
         table = Table(Path(topic.name), rows, kept + 1, names.get(topic.kind, SPEED_COLUMNS))
         return motions_of(table, settings)
 
-    return recorded_motions(topic.name, read)
+    return recorded_motions(read)
 
 
 # --------------------------------------------------------------------------------------------

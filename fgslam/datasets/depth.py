@@ -56,6 +56,7 @@ from fgslam.datasets.times import (
     Pairs,
     Stamps,
     even_stamps,
+    in_seconds,
     listed_files,
     pair_files,
     pair_stamps,
@@ -275,13 +276,11 @@ def _associated(path: Path, fps: float | None) -> tuple[Pairs, Stamps]:
     if fps or (all(map(str.isdecimal, times)) and counts_by_one([int(t) for t in times])):
         why = f"{path.name} counts images and states no times"
         timed = even_stamps(np.arange(len(pairs)), fps, why)
+    elif not times:
+        raise DatasetError(f"{path}: lists no image; restore the file")
     else:
-        stamps = np.array([float(t) for t in times])
-        if len(stamps) == 0 or np.any(np.diff(stamps) <= 0.0):
-            raise DatasetError(
-                f"{path}: lists no image, or times do not increase; restore the file"
-            )
-        timed = Stamps(stamps, (), (), Entry(TIMES, "stamps", str(path), "--fps"))
+        stamps, unit = in_seconds(times, str(path))
+        timed = Stamps(stamps, unit, (), Entry(TIMES, "stamps", str(path), "--fps"))
     return (pairs, (), Entry(PAIRING, "as listed", str(path))), timed._replace(lists=(path,))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
@@ -20,7 +20,7 @@ from fgslam.cameras.formats import read_asl_mounting
 from fgslam.cameras.trees import Values, read_tree
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
-from fgslam.core.files import read_lines
+from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import inverse, rotation_angle, se3_exp
 from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.core.types import Trajectory
@@ -57,17 +57,21 @@ _UNNAMED = {
 """Columns of files without names of columns, and what separates them."""
 
 _NAMES = {
-    "time": "t time stamp timestamp sec secs seconds header_stamp",
-    "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward",
+    "time": "t time stamp timestamp sec secs seconds header_stamp rosbagtimestamp "
+    "stamp_sec stamp_secs header_stamp_sec header_stamp_secs",
+    "nanoseconds": "nsec nsecs nanosec nanosecs nanoseconds stamp_nsec stamp_nsecs stamp_nanosec "
+    "header_stamp_nsec header_stamp_nsecs header_stamp_nanosec",
+    "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward "
+    "linear_velocity_x",
     "yaw_rate": "w wz omega yaw_rate yawrate turn_rate angular_z angular_velocity "
     "twist_angular_z gyro_z w_z omega_z angular_velocity_z gz gyr_z rotation_rate_z w_rs_s_z",
     "rate_x": "wx w_x omega_x angular_x angular_velocity_x gyro_x gx gyr_x rotation_rate_x "
     "w_rs_s_x",
     "rate_y": "wy w_y omega_y angular_y angular_velocity_y gyro_y gy gyr_y rotation_rate_y "
     "w_rs_s_y",
-    **{axis: f"{axis} p{axis} pos_{axis} position_{axis} pose_{axis} t{axis}" for axis in "xyz"},
+    **{a: f"{a} p{a} p_{a} p_rs_r_{a} pos_{a} position_{a} pose_{a} t{a}" for a in "xyz"},
     "yaw": "yaw theta heading phi",
-    **{f"q{axis}": f"q{axis} q_{axis} orientation_{axis}" for axis in "xyzw"},
+    **{f"q{axis}": f"q{axis} q_{axis} q_rs_{axis} orientation_{axis}" for axis in "xyzw"},
 }
 """Names of the columns of each role, in small letters, anything else as `_`."""
 
@@ -117,7 +121,7 @@ def is_of_gyroscope(path: Path) -> bool:
 def file_odometry(path: Path, settings: RecordedOdometrySettings) -> OdometrySource:
     """Body motions by a file, which is read when they are first needed."""
     kind = "rates" if is_of_gyroscope(path) else "speeds" if path.suffix == ".csv" else "poses"
-    return recorded_motions(str(path), lambda: motions_of(read_columns(path, kind), settings))
+    return recorded_motions(lambda: motions_of(read_columns(path, kind), settings))
 
 
 def gyroscope_odometry(
@@ -141,27 +145,17 @@ def gyroscope_odometry(
         stated = GyroscopeNoise() if noise is None else read_gyroscope_noise(noise)
         return motions_of(read_columns(path, "rates"), settings, bRs, stated)
 
-    return recorded_motions(str(path), read)
+    return recorded_motions(read)
 
 
-def recorded_motions(name: str, read: Callable[[], OdometrySource]) -> OdometrySource:
+def recorded_motions(read: Callable[[], OdometrySource]) -> OdometrySource:
     """Body motions of a file or topic that is read when motions are first asked for.
 
     Raises:
         OdometryError: (when motions are asked for) it is malformed, or covers none of the frames.
     """
     read = cache(read)  # motions are asked for again with the clock shifted
-
-    def source(frames: FloatArray) -> Steps:
-        steps = read()(frames)
-        if len(frames) > 1 and all(step is None for step in steps):
-            raise OdometryError(
-                f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); say "
-                "what is to be added to its times: --set odometry.time_offset_s=SECONDS"
-            )
-        return steps
-
-    return source
+    return lambda frames: read()(frames)
 
 
 def read_columns(path: Path, kind: str) -> Table:
@@ -176,18 +170,33 @@ def read_columns(path: Path, kind: str) -> Table:
     """
     lines = read_lines(path, OdometryError)
     names, delimiter = _UNNAMED[kind]
+    header = ""
     if lines and re.search(r"[A-Za-z]", re.sub(r"[eE][-+]?\d", "", lines[0][1])):
         _, header = lines.pop(0)
+    elif lines and kind != "poses":  # a comment may name the columns, as EuRoC's
+        said = read_text(path, OdometryError).lstrip().partition("\n")[0].split(",")
+        if (
+            said[0][:1] == "#"
+            and len(said) == len(lines[0][1].split(","))
+            and all(map(_role, said[:3]))
+        ):
+            header = ",".join(said).lstrip("# ")
+    if header:
         delimiter = next((mark for mark in ",;\t" if mark in header), None)
         names = tuple(header.split(delimiter))
     known = [_role(name) for name in names]
     roles, factors = zip(*filter(None, known), strict=True) if any(known) else ((), ())
+    if "time" not in roles:  # else they are the rest of a second
+        roles = tuple("time" if role == "nanoseconds" else role for role in roles)
     if "time" not in roles:
         raise OdometryError(f"{path}: no column is named time; name the columns")
     used = [name.strip() if role else None for name, role in zip(names, known, strict=True)]
     table = read_table(path, used, delimiter, OdometryError, lines)
     values = table.values * np.where(np.isnan(factors), 1.0, factors)
-    if np.isnan(factors[k := roles.index("time")]):
+    k = roles.index("time")
+    if "nanoseconds" in roles:
+        values[:, k] += values[:, roles.index("nanoseconds")]
+    elif np.isnan(factors[k]):
         slowest = _SLOWEST_GYROSCOPE_S if "rate_x" in roles else _SLOWEST_S
         timed = kind == "rates" or names != _UNNAMED[kind][0]  # of others without names: seconds
         values[:, k] *= time_unit(values[:, k], slowest)[1] if timed else 1.0
@@ -204,7 +213,7 @@ def _role(name: str) -> tuple[str, float] | None:
         return found
     clean = re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
     if role := _ROLES.get(clean):
-        return role, np.nan if role == "time" else 1.0
+        return role, {"time": np.nan, "nanoseconds": 1e-9}.get(role, 1.0)
     for unit in sorted(_UNITS, key=len, reverse=True):
         if clean.endswith(f"_{unit}") and (role := _ROLES.get(clean.removesuffix(f"_{unit}"))):
             return role, _UNITS[unit]
@@ -284,6 +293,7 @@ def motions_of(
         )
     require_increasing(table, time, OdometryError)
     stamps, none = time + settings.time_offset_s, np.zeros(len(time))
+    covering = partial(_covering, path, stamps, settings.time_offset_s)
     are_degrees = ", radians are expected: are these degrees?"
     if has("x", "y", "qx", "qy", "qz", "qw"):
         quaternion = [columns[name] for name in ("qx", "qy", "qz", "qw")]
@@ -294,13 +304,14 @@ def motions_of(
         speed, yaw_rate = columns["speed"], columns["yaw_rate"]
         require_sane(speed, _MAX_SPEED_MPS, "forward speed, m/s")
         require_sane(np.degrees(yaw_rate), _MAX_TURN_DPS, "yaw rate, degrees/s", are_degrees)
-        return lambda frames: speed_motions(stamps, speed, yaw_rate, frames, settings)
+        return covering(lambda frames: speed_motions(stamps, speed, yaw_rate, frames, settings))
     elif has("rate_x", "rate_y", "yaw_rate"):
         rates = np.column_stack([columns[role] for role in RATE_COLUMNS[1:]])
         size = np.degrees(np.linalg.norm(rates, axis=1))
         require_sane(size, _MAX_TURN_DPS, "angular velocity, degrees/s", are_degrees)
         body = rates if bRs is None else rates @ bRs.T
-        return lambda frames: gyroscope_motions(stamps, body, frames, noise or GyroscopeNoise())
+        noise = noise or GyroscopeNoise()
+        return covering(lambda frames: gyroscope_motions(stamps, body, frames, noise))
     else:
         raise OdometryError(
             f"{path}: columns {', '.join(sorted(columns))} were understood; name time with "
@@ -315,7 +326,26 @@ def motions_of(
     require_sane(pace, _MAX_SPEED_MPS, "speed, m/s")
     turns = np.degrees(Rotation.from_matrix(motions[:, :3, :3]).magnitude()) / duration
     require_sane(turns, _MAX_TURN_DPS, "turn, degrees/s")
-    return lambda frames: pose_motions(Trajectory(stamps, poses), frames, settings)
+    return covering(lambda frames: pose_motions(Trajectory(stamps, poses), frames, settings))
+
+
+def _covering(
+    path: Path, stamps: FloatArray, added: float, source: OdometrySource
+) -> OdometrySource:
+    """The source, which refuses frames that it covers nowhere; ``added`` is in its stamps (n,)."""
+
+    def checked(frames: FloatArray) -> Steps:
+        steps = source(frames)
+        if len(frames) > 1 and all(step is None for step in steps):
+            offset = added + frames[0] - stamps[0]
+            raise OdometryError(
+                f"{path}: from {stamps[0]:.3f} to {stamps[-1]:.3f} s, covers none of the frames, "
+                f"{frames[0]:.3f} to {frames[-1]:.3f} s; where its clock is another one, "
+                f"--set odometry.time_offset_s={offset:.3f} lets both begin at once"
+            )
+        return steps
+
+    return checked
 
 
 # --------------------------------------------------------------------------------------------

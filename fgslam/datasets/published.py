@@ -274,7 +274,7 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     name, source = drive.resolve().name, None
     if of_unit is not None:
         truth, speeds = of_unit
-        source = recorded_motions(str(speeds.path), lambda: motions_of(speeds, odometry))
+        source = recorded_motions(lambda: motions_of(speeds, odometry))
     ledger = Entry(IMAGES, f"{names[1]} is right", "names of folders"), timing, pairing
     recording = image_recording(
         settings, name, rig, stamps, images, files, notes, ledger, odometry_source=source

@@ -387,7 +387,7 @@ def written_stamps(
     for path in (folder / name for folder in folders for name in LISTS):
         if path.is_file():
             entry = Entry(TIMES, "stamps", str(path), "--fps")
-            read = _in_seconds(_listed(path, images, every or images), str(path))
+            read = in_seconds(_listed(path, images, every or images), str(path))
             return Stamps(*read, (path,), entry)
     names = [image.stem for image in images]
     by_date = _dates(names)
@@ -399,7 +399,7 @@ def written_stamps(
         return None
     texts = [f"{whole}.{part}" for whole, part in zip(*parts, strict=True)]
     mend = "two names of a folder are one time: remove one"
-    return Stamps(*_in_seconds(texts, entry.source, mend), (), entry)
+    return Stamps(*in_seconds(texts, entry.source, mend), (), entry)
 
 
 def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, float]:
@@ -414,7 +414,7 @@ def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, fl
     )
 
 
-def _in_seconds(
+def in_seconds(
     texts: Sequence[str],
     where: str,
     mend: str = "put the lines in time order and remove duplicates",

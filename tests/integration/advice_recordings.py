@@ -574,7 +574,7 @@ OF_RECORDINGS = {
         lambda root: driven(root, "/odom"), r"\((dataset.camera_yaw_deg) and", r"--set \1=0"
     ),
     "odometry on another clock": Advice(
-        late_odometry, r"to its times: (--set odometry.time_offset_s)=SECONDS", r"\1=-1000",
+        late_odometry, r"(--set odometry.time_offset_s=-[\d.]+) lets both begin at once", r"\1",
         command=("run", "--estimator odometry --out {}/out"),
     ),
     "several layouts": Advice(

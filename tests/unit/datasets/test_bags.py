@@ -417,7 +417,7 @@ def test_truth_is_no_odometry_and_another_clock_is_said(tmp_path: Path) -> None:
     assert "not taken for odometry: /ground_truth/state (truth by its name)" in recording.notes[0]
     late = odometry([stamp + 10**12 for stamp in stamps], poses)
     other = opened(write_bag(tmp_path / "b.bag", stereo(4) + late))
-    with pytest.raises(OdometryError, match="/odom covers none of the frames"):
+    with pytest.raises(OdometryError, match=r"/odom: from .* covers none of the frames"):
         other.odometry(1)
 
 

@@ -55,7 +55,7 @@ def seen_with(
     turns = np.array([so3_log(r) for r in rotations]) + noise * rng.standard_normal((59, 3))
     measured = unit * (true @ (np.eye(3) if axes is None else axes).T + BIAS)
     late_motions = partial(gyroscope_motions, SAMPLES + late, measured, noise=GyroscopeNoise())
-    source = recorded_motions("shaken", lambda: late_motions)
+    source = recorded_motions(lambda: late_motions)
     return SeenTurns("shaken", np.arange(1, 60), turns, FRAMES, source, by_gyroscope=True)
 
 

@@ -320,16 +320,18 @@ def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("depth_first", [False, True])
 @pytest.mark.parametrize("counted", [False, True])
-@pytest.mark.parametrize("mark", [" ", ","])
+@pytest.mark.parametrize(("mark", "unit"), [(" ", 1.0), (",", 1.0), (" ", 1000.0)])
 def test_a_list_of_associations_pairs_and_times(
-    tmp_path: Path, depth_first: bool, counted: bool, mark: str
+    tmp_path: Path, depth_first: bool, counted: bool, mark: str, unit: float
 ) -> None:
     lines = []
     for k in range(4):
         save(tmp_path / "rgb" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
         save(tmp_path / "depth" / f"{7 - k}.png", np.full((HEIGHT, WIDTH), 2000 + k, np.uint16))
         colour_at, depth_at = (
-            (str(k), str(k)) if counted else (f"{5.1 + k / 30}", f"{5.105 + k / 30}")
+            (str(k), str(k))
+            if counted
+            else (f"{unit * (5.1 + k / 30)}", f"{unit * (5.105 + k / 30)}")
         )
         words = [f"{colour_at} rgb/{k}.png", f"{depth_at} depth/{7 - k}.png"]
         lines.append(" ".join(words[::-1] if depth_first else words))

@@ -191,7 +191,7 @@ def test_poses_are_not_held_beyond_their_ends(tmp_path: Path) -> None:
 
 
 BAD_LOGS = [
-    ("0.1,1,0\n0.2,nan,0\n", ["line 3", "forward speed is nan", "not finite"]),
+    ("0.1,1,0\n0.2,nan,0\n", ["line 3", "v is nan", "not finite"]),
     ("0.1,1,0\n0.2,400,0\n", ["line 3", "400 m/s is absurd", "limit 60"]),
     ("0.1,1,0\n0.2,1,-99\n", ["line 3", "yaw rate", "absurd", "limit 720"]),
     ("0.1,1,0\n0.3,1,0\n0.2,1,0\n", ["line 4", "0.200000", "time order"]),
@@ -638,3 +638,31 @@ def test_full_names_of_ros_are_known_by_their_last_parts(tmp_path: Path, mark: s
     pose_names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     assert table.names == ("time", "time", *pose_names, "speed", "yaw_rate")
     np.testing.assert_allclose(table.values[:, 0], [0.0, 0.1, 0.2], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("header.stamp.sec,header.stamp.nanosec,linear.x,angular.z", "{s},{rest},1,0"),
+        ("secs,nsecs,v,w", "{s},{rest},1,0"),
+        ("nanoseconds,v,w", "{ns},1,0"),
+        ("rosbagTimestamp,Linear Velocity X,Angular Velocity Z", "{ns},1,0"),
+        (
+            "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],q_RS_w,q_RS_x,q_RS_y,q_RS_z",
+            "{ns},0,0,1,0,0,0",
+        ),
+        ("t_s,p_x_m,p_y_m,yaw_deg", "{t},0,0,0"),
+    ],
+)
+def test_times_in_parts_and_names_of_other_tools(tmp_path: Path, header: str, row: str) -> None:
+    given = [1_700_000_000_900_000_000 + k * 100_000_000 for k in range(3)]
+    rows = [
+        row.format(s=ns // 10**9, rest=ns % 10**9, ns=ns, t=f"{ns // 10**9}.{ns % 10**9:09d}")
+        for ns in given
+    ]
+    path = tmp_path / "odom.csv"
+    path.write_text("\n".join([header, *rows]), encoding="utf-8")
+    table = read_columns(path, "speeds")
+    times = table.values[:, table.names.index("time")]
+    np.testing.assert_allclose(times, 1e-9 * np.array(given, np.float64), rtol=0.0, atol=1e-6)
+    assert {"x", "speed"} & {*table.names}
