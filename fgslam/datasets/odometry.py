@@ -58,11 +58,10 @@ _UNNAMED = {
 
 _NAMES = {
     "time": "t time stamp timestamp sec secs seconds header_stamp rosbagtimestamp "
-    "stamp_sec stamp_secs header_stamp_sec header_stamp_secs",
-    "nanoseconds": "nsec nsecs nanosec nanosecs nanoseconds stamp_nsec stamp_nsecs stamp_nanosec "
-    "header_stamp_nsec header_stamp_nsecs header_stamp_nanosec",
-    "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward "
-    "linear_velocity_x",
+    "stamp_sec stamp_secs",
+    "nanoseconds": "nsec nsecs nanosec nanosecs nanoseconds stamp_nsec stamp_nsecs stamp_nanosec",
+    "speed": "v vx speed velocity forward_speed linear_x linear_velocity linear_velocity_x "
+    "twist_linear_x v_forward",
     "yaw_rate": "w wz omega yaw_rate yawrate turn_rate angular_z angular_velocity "
     "twist_angular_z gyro_z w_z omega_z angular_velocity_z gz gyr_z rotation_rate_z w_rs_s_z",
     "rate_x": "wx w_x omega_x angular_x angular_velocity_x gyro_x gx gyr_x rotation_rate_x "

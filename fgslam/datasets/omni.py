@@ -364,8 +364,8 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
         return (*_panorama_notes(camera), *_end_notes(recording, camera))
     if isinstance(camera, LensCamera):
         middle, other = ("up", "down") if camera.up else ("down", "up")
-        turn = "clockwise" if camera.clockwise else "counter-clockwise"
-        opposite = "false" if camera.clockwise else "true"
+        turns = ("clockwise", "false"), ("counter-clockwise", "true")
+        turn, opposite = turns[not camera.clockwise]
         assumed = (
             f"the picture's middle is taken to look {middle}, bearings to grow {turn} in it (--set "
             f"dataset.camera.middle={other}, --set dataset.camera.clockwise={opposite} otherwise)",

@@ -303,10 +303,5 @@ def next_commands(folder: Path | str, images: bool) -> tuple[str, ...]:
     run = shlex.quote(str(folder))
     compare = f"fgslam compare {run} --estimators landmark_kalman,isam2,batch"
     export = f"fgslam export {run} --map map.ply"
-    if not images:
-        return compare, export
-    return (
-        compare,
-        f"{export} --colour --dense cloud.ply --grid map.yaml",
-        f"fgslam film {run} run.mp4",
-    )
+    dense = f"{export} --colour --dense cloud.ply --grid map.yaml"
+    return (compare, dense, f"fgslam film {run} run.mp4") if images else (compare, export)

@@ -102,10 +102,10 @@ def film_of_run(
     require_film_suffix(out)
     taught, given = shown.taught, [path for path in (shown.taught, shown.recording) if path]
     require_output(out, overwrite, (*sources_of(run), *given))
-    config = (
-        load_experiment(run / RUN_MARKER, moved_to(shown.recording)) if is_run_folder(run) else None
-    )
-    if isinstance(config, FollowConfig):
+    moved = moved_to(shown.recording)
+    if is_run_folder(run) and isinstance(
+        config := load_experiment(run / RUN_MARKER, moved), FollowConfig
+    ):
         if shown.estimator is not None:
             raise ConfigError(
                 f"{run}: a route was followed, without estimators; leave out --estimator"
