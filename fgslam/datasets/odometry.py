@@ -173,13 +173,13 @@ def read_columns(path: Path, kind: str) -> Table:
     if lines and re.search(r"[A-Za-z]", re.sub(r"[eE][-+]?\d", "", lines[0][1])):
         _, header = lines.pop(0)
     elif lines and kind != "poses":  # a comment may name the columns, as EuRoC's
-        said = read_text(path, OdometryError).lstrip().partition("\n")[0].split(",")
+        stated = read_text(path, OdometryError).lstrip().partition("\n")[0].split(",")
         if (
-            said[0][:1] == "#"
-            and len(said) == len(lines[0][1].split(","))
-            and all(map(_role, said[:3]))
+            stated[0][:1] == "#"
+            and len(stated) == len(lines[0][1].split(","))
+            and all(map(_role, stated[:3]))
         ):
-            header = ",".join(said).lstrip("# ")
+            header = ",".join(stated).lstrip("# ")
     if header:
         delimiter = next((mark for mark in ",;\t" if mark in header), None)
         names = tuple(header.split(delimiter))
