@@ -478,7 +478,8 @@ _ERRS = {
     "odometry_turned": "its ways are {degrees:.0f} degrees off the direction in which images "
     "show them (the axes of its frame, or dataset.camera_yaw_deg)",
     "odometry_turns": "its turns are {ratio:.2f} +- {scatter:.2f} of those that images show "
-    "(degrees or radians, the sign of the yaw, or wheels that slip in turns)",
+    "(degrees or radians, the sign of the yaw, wheels that slip in turns; or the rig's focal "
+    "length is not as stated)",
 }
 """How odometry errs, by the code of a remark on it."""
 _PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "
