@@ -429,7 +429,8 @@ class Witnesses:
                 way = np.append(np.zeros(3), step.motion[:3, 3])
                 known = np.linalg.solve(noise, way)
                 longer = known @ se3_log(inverse(expected) @ pose.wTc)
-                self._scale = self._scale + np.array([known @ way, longer])
+                if known @ way > _GATE:  # what is noise alone has no scale
+                    self._scale = self._scale + np.array([known @ way, longer])
         given, self._shown = self._shown, in_order(self._shown)
         pairs = zip(given, self._shown, strict=True)
         if moved := [one.number for one, there in pairs if one.wTc is not there.wTc]:

@@ -154,6 +154,12 @@ def test_scales_that_differ_by_less_than_a_frame_shows_are_both_held() -> None:
     assert off < 3.0 * np.sqrt(np.trace(found.online_covariances[-1][3:, 3:]))
 
 
+def test_odometry_of_a_standing_robot_has_no_scale() -> None:
+    """It is noise alone, and images show nothing of it: no scale of zero."""
+    with driven(moved=lambda k: 0.0) as session:
+        assert codes(session.result()) == []
+
+
 def test_odometry_that_jumps_to_and_fro_is_no_fault_of_the_images() -> None:
     with driven(lambda k, step: step + (k >= BEGINS) * (0.3 if k % 2 else -0.1)) as session:
         assert codes(session.result()) == ["odometry_slips"]
