@@ -85,7 +85,8 @@ def test_a_moved_prior_moves_everything_rigidly(
     play(there, increments, SIXDOF)
     a, b = here.estimate(), there.estimate()
     np.testing.assert_allclose(b.trajectory.poses, moved_by @ a.trajectory.poses, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(b.covariances, a.covariances, rtol=1e-3, atol=1e-9)
+    # Particles' weights differ by rounding, which processors do differently: 0.2 % of a variance.
+    np.testing.assert_allclose(b.covariances, a.covariances, rtol=1e-3, atol=2e-9)
     np.testing.assert_array_equal(b.landmarks.ids, a.landmarks.ids)
     expected = g.transform_to_world(moved_by, a.landmarks.positions)
     np.testing.assert_allclose(b.landmarks.positions, expected, rtol=0, atol=1e-6)

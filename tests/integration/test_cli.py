@@ -346,7 +346,7 @@ def test_export_of_images_says_where_the_recording_is_gone(
     text = config.read_text()
     config.write_text(re.sub(r"path: .*", "path: /gone", text))
     text = mistake(capfd, monkeypatch, "export", run, "--images", tmp_path / "model")
-    assert "/gone: the run's recording is not there any more" in text
+    assert "the recording /gone does not exist" in text
     assert "--recording PATH" in text
     given = ("--images", tmp_path / "model", "--recording", recording)
     assert main(monkeypatch, "export", run, *given) == 0

@@ -121,7 +121,7 @@ def test_logs_are_compared(
     ("options", "words"),
     [
         (("--estimators", "isam2"), "no estimator 'isam2'; give --estimators with some of homing_"),
-        (("--set", "estimators.alv.gate=1"), "unknown key estimator.gate"),
+        (("--set", "estimators.alv.gate=1"), "unknown key estimators.alv.gate"),
         (("--set", "gate=1"), "what was measured stays as it is; estimators.NAME.key=value"),
         (("--out", "{run}"), "holds the run itself"),
     ],
