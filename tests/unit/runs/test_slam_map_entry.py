@@ -69,7 +69,7 @@ def test_a_file_that_is_none_is_left_as_it_is(root: Path, foreign: bytes) -> Non
     assert str(path) in found.fault
     assert len(found.notes(None)) == 1
     assert path.read_bytes() == foreign
-    with pytest.raises(CalibrationError, match="move (it|this one) away"):
+    with pytest.raises(CalibrationError, match=r"move (it|this one) away"):
         opened(remembering(root, str(path)))
 
 
