@@ -231,6 +231,11 @@ def middle(values: FloatArray) -> float:
     return float((ordered[(n - 1) // 2] + ordered[n // 2]) / 2.0)
 
 
+def robust_spread(values: FloatArray) -> float:
+    """Median absolute deviation (n,) scaled to a normal distribution's standard deviation."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
 def student_quantile(probability: ArrayLike, dof: ArrayLike) -> FloatArray:
     """Values that a Student's t variable of ``dof`` degrees stays below with that probability."""
     from scipy.special import stdtrit

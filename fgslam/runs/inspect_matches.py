@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, Rows, thinned
+from fgslam.core.arrays import FloatArray, IntArray, Rows, robust_spread, thinned
 from fgslam.core.errors import FrameError
 from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
@@ -255,13 +255,13 @@ def check_pair(matches: Matches, frames: IntArray, pair: Pair) -> list[Finding]:
     unsteady = _check_steadiness(steady, matches.frame, frames, pair)
     if len(disparities) < _FEWEST_MATCHES:
         return [finding("few_to_judge", **about), *unsteady]
-    offset, spread = round(float(np.median(offsets)), 2) + 0.0, _robust_spread(offsets)
+    offset, spread = round(float(np.median(offsets)), 2) + 0.0, robust_spread(offsets)
     low, high = np.percentile(disparities, [5.0, 95.0])
     within = np.percentile(np.abs(offsets), 95.0)
     about |= {"offset": offset, "spread": spread, "within": within, "low": low, "high": high}
     found = [finding("epipolar", **about)]
     # Whether the disparity runs across the direction in which it should.
-    middle, along = abs(float(np.median(disparities))), _robust_spread(disparities)
+    middle, along = abs(float(np.median(disparities))), robust_spread(disparities)
     still = middle < _MAX_ROW_OFFSET_PX and along < _MAX_ROW_SPREAD_PX
     big = abs(float(np.median(offsets))) > 2.0 * _MAX_ROW_OFFSET_PX
     if still and (big or spread > _MAX_ROW_SPREAD_PX):
@@ -269,7 +269,7 @@ def check_pair(matches: Matches, frames: IntArray, pair: Pair) -> list[Finding]:
     if abs(offset) > _MAX_ROW_OFFSET_PX:
         found.append(finding("shifted", **about))
     if spread > _MAX_ROW_SPREAD_PX:
-        explained = _robust_spread(steady) < 0.6 * spread
+        explained = robust_spread(steady) < 0.6 * spread
         found.append(finding("scattered", **about, cause=cause if explained else _SCATTER))
     elif at_edge > _MAX_EDGE_PX:
         found.append(finding("edges", **about, edge=at_edge, cause=cause))
@@ -278,11 +278,6 @@ def check_pair(matches: Matches, frames: IntArray, pair: Pair) -> list[Finding]:
         code = "swapped" if negative > 0.5 else "negative"
         found.append(finding(code, **about, percent=100.0 * negative))
     return [*found, *unsteady]
-
-
-def _robust_spread(values: FloatArray) -> float:
-    """Median absolute deviation (n,) scaled to a normal distribution's standard deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def _negative_share(disparities: FloatArray) -> float:
@@ -309,7 +304,7 @@ def _fitted_turn(matches: Matches, pair: Pair) -> tuple[FloatArray, float, str]:
     slopes: FloatArray = np.zeros(3)
     for _ in range(_FIT_STEPS):
         left = target - design @ slopes
-        weight = 1.0 / (1.0 + (left / max(_robust_spread(left), 0.1)) ** 2)
+        weight = 1.0 / (1.0 + (left / max(robust_spread(left), 0.1)) ** 2)
         solution = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
         slopes = np.asarray(solution, np.float64)
     edge = np.percentile(np.abs(design[:, 1:]), 95.0, axis=0) * np.abs(slopes[1:])

@@ -36,7 +36,7 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.core.yaml_text import plain_values
 from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.opening import open_measurements
-from fgslam.datasets.settings import SimulatedMeasurementsSettings
+from fgslam.datasets.settings import MeasurementDatasetSettings, SimulatedMeasurementsSettings
 from fgslam.evaluation.judging import (
     SIGNIFICANT,
     MeanInterval,
@@ -430,9 +430,9 @@ def perform_trial(config: ExperimentConfig, estimators: Sequence[EstimatorSettin
     with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
         run, output = Path(scratch) / "run", OutputSettings(False, False, checkpoint_seconds=1e9)
         alone = config.model_copy(update={"compare": (), "output": output})
-        if config.on_measurements:
+        if isinstance(config.dataset, MeasurementDatasetSettings):
             run.mkdir()
-            opened = open_measurements(config.dataset, config.seed, config.odometry)  # type: ignore[arg-type]
+            opened = open_measurements(config.dataset, config.seed, config.odometry)
             write_log_and_truth(run, opened)
         else:
             run_task(open_slam, alone, run)

@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows, robust_spread
 from fgslam.core.geometry import (
     adjoint,
     compose_covariance,
@@ -416,7 +416,7 @@ class Witnesses:
 
     def _look_for_order(self, increment: Increment, pose: EgoMotion) -> None:
         """Whether the images of the last frames belong to others of them."""
-        step = increment.odometry
+        step = increment.odometry  # measured, or of a constant velocity
         if step is None or not pose.status.measured:
             self._shown = []
             return
@@ -424,18 +424,21 @@ class Witnesses:
         here = Shown(increment.index, step.measured, pose.wTc, step.motion, noise)
         self._shown = [*self._shown, here][-_RATIOS:]
         if len(self._shown) > 1 and step.measured and self._other is None:
-            expected = self._shown[-2].wTc @ step.motion
-            if _squared(expected, pose.wTc, noise) < _GATE:
-                way = np.append(np.zeros(3), step.motion[:3, 3])
-                known = np.linalg.solve(noise, way)
-                longer = known @ se3_log(inverse(expected) @ pose.wTc)
-                if known @ way > _GATE:  # what is noise alone has no scale
-                    self._scale = self._scale + np.array([known @ way, longer])
+            self._compare_ways(*self._shown[-2:])
         given, self._shown = self._shown, in_order(self._shown)
         pairs = zip(given, self._shown, strict=True)
         if moved := [one.number for one, there in pairs if one.wTc is not there.wTc]:
             self.disordered = sorted({*self.disordered, *moved})
             self._jumping, self._agreeing = True, 0
+
+    def _compare_ways(self, before: Shown, here: Shown) -> None:
+        """Adds what an agreeing step shows of the images' scale over odometry's."""
+        expected, way = before.wTc @ here.motion, np.append(np.zeros(3), here.motion[:3, 3])
+        known = np.linalg.solve(here.covariance, way)
+        # What is noise alone has no scale.
+        if _squared(expected, here.wTc, here.covariance) < _GATE < known @ way:
+            longer = known @ se3_log(inverse(expected) @ here.wTc)
+            self._scale = self._scale + np.array([known @ way, longer])
 
     def _lately(self) -> list[Contradiction]:
         """The last contradicted frames of this episode."""
@@ -678,14 +681,11 @@ def _odometry_errs(frames: Sequence[Contradiction], agreed_m: float) -> _Cause:
     kind = _TURN_AND_WAY[0 if turns > ways else 1]
     seen, given = (np.array([getattr(one, name)[kind] for one in frames]) for name in _WITNESSES)
     lengths = np.maximum(np.linalg.norm([seen, given], axis=2), 1e-12)
-    (length, _), (angle, strays), (ratio, scatter) = map(
-        _typical,
-        (
-            lengths[1] / lengths[0],
-            np.arccos(np.clip((seen * given).sum(axis=1) / lengths.prod(axis=0), -1.0, 1.0)),
-            (seen * given).sum(axis=1) / lengths[0] ** 2,
-        ),
-    )
+    common = (seen * given).sum(axis=1)
+    ratios = common / lengths[0] ** 2
+    angles = np.arccos(np.clip(common / lengths.prod(axis=0), -1.0, 1.0))
+    length, ratio, angle = np.median([lengths[1] / lengths[0], ratios, angles], axis=1).tolist()
+    scatter, strays = robust_spread(ratios), robust_spread(angles)
     if turns > ways:
         return "odometry_turns", {"ratio": ratio, "scatter": scatter}
     if length < _STUCK:
@@ -697,12 +697,6 @@ def _odometry_errs(frames: Sequence[Contradiction], agreed_m: float) -> _Cause:
         return "odometry_slips", {}
     code = "odometry_reversed" if ratio < 0.0 else "odometry_scaled"
     return code, {"ratio": ratio, "scatter": scatter}
-
-
-def _typical(values: FloatArray) -> tuple[float, float]:
-    """Median of values (n,), and their robust standard deviation."""
-    centre = float(np.median(values))
-    return centre, 1.4826 * float(np.median(np.abs(values - centre)))
 
 
 def _body_moves(frames: Sequence[Contradiction]) -> _Cause:

@@ -9,6 +9,7 @@ import numpy as np
 
 from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementRecording, write_landmark_truth
 from fgslam.datasets.opening import open_measurements
+from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import read_table, records, write_timing
 from fgslam.runs.config import ExperimentConfig
@@ -23,7 +24,8 @@ _NUMBERS = ("inliers", "solve_ms", "update_ms")
 
 def open_measurements_task(config: ExperimentConfig, opening: Opening) -> Task[RunResult]:
     """Opens or simulates the recording. Raises FgslamError."""
-    recording = open_measurements(config.dataset, config.seed, config.odometry)  # type: ignore[arg-type]
+    assert isinstance(config.dataset, MeasurementDatasetSettings)  # noqa: S101 - run.py has asked
+    recording = open_measurements(config.dataset, config.seed, config.odometry)
     return Task(provenance_of(recording), lambda context: _run(config, recording, context))
 
 
