@@ -84,7 +84,7 @@ class LandmarkTracker:
         self.expects_returns = False
         self.rig = rig
         self.database = database
-        self._matcher = matcher
+        self.matcher = matcher
         self._ego_motion = ego_motion
         self.noise = ego_motion.noise
         self.resection = Resection(ego_motion)
@@ -98,15 +98,15 @@ class LandmarkTracker:
         """Matches expected landmarks, solves for the pose; wider or again around it if set so."""
         around = self.constrained(prediction)
         tracked = self.match_and_solve(prediction, around, landmarks, features)
-        if self._matcher.rescues and not tracked.ego_motion.status.measured:
+        if self.matcher.rescues and not tracked.ego_motion.status.measured:
             rescued = self.match_and_solve(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
-        if self._matcher.rescues and self._is_doubtful(tracked, features):
+        if self.matcher.rescues and self._is_doubtful(tracked, features):
             again = self._regained(landmarks, features)
             if again is not None and _used(again) >= 2 * _used(tracked):
                 return again
-        if self._matcher.refines and self._moved_far(tracked, landmarks):
+        if self.matcher.refines and self._moved_far(tracked, landmarks):
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
             refined = self.match_and_solve(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
@@ -131,7 +131,7 @@ class LandmarkTracker:
         expected: ExpectedLandmarks,
     ) -> FloatArray | None:
         """Standard deviations (v, 3) of the predicted measurements, where the matcher asks."""
-        if not self._matcher.widens:
+        if not self.matcher.widens:
             return None
         rows = expected.rows
         covariance = predicted_covariance(
@@ -311,9 +311,9 @@ class LandmarkTracker:
         """Landmarks expected from a pose, and their matches: near there, or ``anywhere``."""
         expected = self.database.expected(landmarks, around.wTc)
         if anywhere:
-            return expected, self._matcher.match_anywhere(expected, features)
+            return expected, self.matcher.match_anywhere(expected, features)
         uncertainty = self._uncertainty(around, landmarks, expected)
-        return expected, self._matcher.match(expected, features, uncertainty)
+        return expected, self.matcher.match(expected, features, uncertainty)
 
     def merge(self, pairs: IntArray) -> IntArray:
         """Makes landmarks found to be one into one; returns the identities that end.
