@@ -456,6 +456,8 @@ _WINDOW = 5  # frames that are judged together where one alone does not tell
 _STOP = 2.0 ** (1.0 / 3.0)
 """Ratio of grey values: a third of a stop, the step in which exposures are set. Two cameras of one
 rig that differ by it do not have the same exposure."""
+FEW_DISPLACED = 3
+"""Frames whose pair does not show the map, from which on it begins none."""
 _DARKEST = 8.0  # grey value below which a ratio is noise
 _FEWEST_COMPARED = 20  # points
 
@@ -485,6 +487,7 @@ class CameraWatch:
     _sums: Kept[list[int]]
     _frames: Kept[int]
     _doubled: Kept[int]
+    displaced: Kept[int]
 
     def __init__(self, rig: CameraRig) -> None:
         """Nothing seen yet."""
@@ -497,6 +500,7 @@ class CameraWatch:
         self._before = []
         self._sums = [-1] * rig.cameras
         self._frames = self._doubled = 0
+        self.displaced = 0  # frames in a row in which one image shows the map and the pair does not
         self._same = np.zeros(rig.cameras, np.bool_)
         self.alone: int | None = None
         """Of the last frame, if it is refused: the first camera whose image is usable."""
@@ -578,6 +582,16 @@ class CameraWatch:
         good = np.flatnonzero(~(np.array(self._late) | (self._same & bool(repeated))))
         self.alone = int(good[0]) if fault and not swapped and len(good) else None
         return fault, seen
+
+    def in_place(self, expected: FloatArray, measured: FloatArray) -> bool:
+        """Whether a pair's disparities (n,) are those of landmarks that one image locates.
+
+        As nearly as any calibration leaves them; NaN of what has no partner.
+        """
+        near = np.abs(measured - expected) <= IMPLAUSIBLE_PX
+        fits = bool(2 * near.sum() > len(near))
+        self.displaced = 0 if fits else self.displaced + 1
+        return fits
 
     @property
     def knocked(self) -> bool:

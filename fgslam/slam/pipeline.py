@@ -31,11 +31,11 @@ from fgslam.core.types import (
     StereoFeatures,
     UpdateStats,
 )
-from fgslam.frontend.camera_faults import CameraWatch
+from fgslam.frontend.camera_faults import FEW_DISPLACED, CameraWatch
 from fgslam.frontend.stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import MatchNoise, unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
-from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
+from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
@@ -44,6 +44,12 @@ from fgslam.slam.witnesses import Frame, Witnesses, has_moved
 if TYPE_CHECKING:
     from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
+
+
+_DISPLACED = (
+    "what one image shows of the map is not where the calibration has it in another (a camera that "
+    "was moved, turned, mirrored, covered)"
+)
 
 
 def no_ids() -> IntArray:
@@ -135,6 +141,8 @@ class SlamPipeline:
             frame = self._find_features(frame, carried, before)  # 2.1
             every = self._match_stereo(frame)  # 2.2
             every, matched = self._track(now._replace(features=every), frame, carried)
+            if matched.problem:
+                frame = dataclasses.replace(frame, problem=matched.problem, refused=True)
             stereo = features = every.whole
             matched = self._recognise_places(matched, stereo, landmarks)
         if self.look_ahead is not None and self.key_frames and self.key_frames.nears_end:
@@ -280,6 +288,8 @@ class SlamPipeline:
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
             tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
             initialises = self.places.maps_on
+        if len(landmarks) and (by_one := self._track_displaced(now, frame, tracked)):
+            return stereo, by_one
         judged = self.witnesses.judge(now._replace(features=stereo), tracked)
         tracked = judged.tracked
         status = tracked.ego_motion.status
@@ -312,6 +322,40 @@ class SlamPipeline:
         if self.witnesses.contradicts(now, pose) or not pose.status.measured:
             return None
         return Matched(pose, self.tracker.associate_carried(tracked, as_rig), now.odometry)
+
+    def _track_displaced(self, now: Frame, frame: FeatureFrame, tracked: Tracked) -> Matched | None:
+        """A frame whose pair fits no landmark, by the image that does; None where the pair counts.
+
+        Where none does any more, by odometry: what such a pair measures begins no map.
+        """
+        watch = self.watch
+        if watch is None:
+            return None
+        if tracked.ego_motion.status.measured:
+            watch.displaced = 0
+            return None
+        for camera, found in enumerate(frame.features):
+            seen = self.stereo.matcher.alone(camera, found, self._correction())
+            alone, as_rig = self.tracker.track_alone(camera, now.prediction, now.landmarks, seen)
+            pose, at = alone.ego_motion, alone.matches.features[alone.ego_motion.inliers]
+            if not pose.status.measured or self.witnesses.contradicts(now, pose):
+                continue
+            pair = now.features
+            places = map(tuple, pair.pixels[:, camera].tolist())
+            shown = dict(zip(places, pair.measurement[:, 2].tolist(), strict=True))
+            measured = np.array([shown.get(tuple(xy), math.nan) for xy in found.xy[at].tolist()])
+            if watch.in_place(as_rig.measurement[at, 2], measured):
+                return None
+            kept = self.tracker.associate_carried(alone, as_rig)
+            problem = f"{_DISPLACED} (the {CAMERA_NAMES[camera]} image alone is left)"
+            ids = alone.expected.ids[alone.matches.landmarks[pose.inliers]]
+            if self.witnesses.repeats(seen, at, alone, ids):  # the pair may have mistaken its parts
+                problem, watch.displaced = "", 0
+            return Matched(pose, kept, now.odometry, problem=problem)
+        if watch.displaced < FEW_DISPLACED:
+            return None
+        blind = self.tracker.track_blind(now.around, EgoMotionStatus.CAMERA_FAULT)
+        return Matched(blind, Association.nothing(), now.taken, problem=_DISPLACED)
 
     @timed("places")
     def _recognise_places(
@@ -430,6 +474,7 @@ class Matched:
     odometry: Odometry | None
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
+    problem: str = ""  # of images that are not used
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -52,7 +52,7 @@ Verdict: TypeAlias = Literal["agreed", "images", "odometry", "undecided"]
 _GATE = 40.0
 """Chi-square, six degrees of freedom, beyond which the witnesses contradict each other: chance once
 in two million; errors of a map persist, and reach 17 on sound drives."""
-_SIGMAS = 3.0  # by which ways of a whole drive differ: no pose is changed for it
+_SIGMAS = 3.0  # by which ways of a whole drive differ, where that is reported: no pose changes
 _MOUNT = 0.02
 """Of the way: a camera's yaw on its robot is known to a degree, a rig's scale to two percent; in no
 covariance is either. Without, a real road contradicts its odometry until the rig is known."""
@@ -321,7 +321,7 @@ class Witnesses:
             known.ids[against & own.inliers],
             int(against.sum()),
             aliased,
-            aliased or self._repeats(features, at[only], images, ids[only]),
+            aliased or self.repeats(features, at[only], images, ids[only]),
         )
 
     def _around(
@@ -359,7 +359,7 @@ class Witnesses:
             return False
         return self._squared(frame.step, frame.prediction, pose) > _GATE
 
-    def _repeats(
+    def repeats(
         self, features: StereoFeatures, at: IntArray, images: Tracked, ids: IntArray
     ) -> bool:
         """Whether most of some features (k,) resemble others of the image as their landmarks."""
@@ -407,12 +407,11 @@ class Witnesses:
         self.score[-1] = _MOST if odometry.rejoined or jumps else score
 
     @property
-    def _longer(self) -> float:
-        """Share by which ways of all agreed frames are longer in images, beyond what is known."""
+    def _longer(self) -> tuple[float, float]:
+        """Share by which ways of all agreed frames are longer in images, and its deviation."""
         information, score = self._scale.tolist()
-        longer = score / max(information, 1e-12)
-        known = math.hypot(_MOUNT, max(information, 1e-12) ** -0.5)
-        return longer if abs(longer) > _SIGMAS * known else 0.0
+        variance = 1.0 / max(information, 1e-12)
+        return score * variance, math.sqrt(variance)
 
     def _look_for_order(self, increment: Increment, pose: EgoMotion) -> None:
         """Whether the images of the last frames belong to others of them."""
@@ -525,16 +524,16 @@ class Witnesses:
 
         Where odometry turned out right, frames that followed the images are placed by its chain.
         """
-        if not self.apart and not self._longer:
-            return estimate
         by_images, relative = estimate.trajectory.poses, {}
+        others = self._others(by_images)
+        if not self.apart and not others:
+            return estimate
         poses, chains = by_images.copy(), np.zeros_like(estimate.covariances)
         episodes = np.full(len(poses), -1)
         for one in self.apart:
             if self.score[one.episode] > _DECIDED:
                 poses[one.row] = by_images[one.row] @ one.iTo
                 chains[one.row], episodes[one.row] = one.covariance, one.episode
-        others = self._others(by_images)
         online = dict(estimate.online_relative)
         for lag in {**estimate.relative, **online}:
             motions = inverse(poses[:-lag]) @ poses[lag:]
@@ -573,10 +572,11 @@ class Witnesses:
                     if one.row >= first:
                         iTo[one.row - first] = one.iTo
                 out.append((1.0 / (1.0 + math.exp(-score)), iTo))
-        if self._longer:  # whose scale is wrong is open
+        longer, sigma = self._longer
+        if abs(longer) > sigma:  # beyond noise it is open whose scale is wrong
             scaled = poses.copy()
-            scaled[:, :3, 3] /= 1.0 + self._longer
-            out.append((0.5, inverse(poses) @ scaled))
+            scaled[:, :3, 3] /= 1.0 + longer
+            out.append((0.5 - 0.5 * (sigma / longer) ** 2, inverse(poses) @ scaled))
         return out
 
     def _decided(self, one: Contradiction) -> Verdict:
@@ -604,7 +604,8 @@ class Witnesses:
         )
         jumps = sorted({*self.disordered, *(one.number for one in by["jumps"])})
         out = [Remark("images_out_of_order", tuple(jumps))] if jumps else []
-        if longer := self._longer:
+        longer, sigma = self._longer
+        if abs(longer) > _SIGMAS * math.hypot(_MOUNT, sigma):
             out.append(Remark("scale_doubted", values={"ratio": 1.0 / (1.0 + longer)}))
         out += (
             Remark(code, tuple(one.number for one in frames), values)

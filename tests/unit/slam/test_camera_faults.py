@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from passing import PASSING_RIG, SCENE, pair_of
 
 import fgslam as fg
 from fgslam.core.arrays import Image
@@ -134,3 +136,41 @@ def test_frames_before_the_world_begins_are_worked_on_once(
     first = 1 if tracking == "hybrid" else len(images)
     assert len(calls) == first + 3 * len(images)
     assert len(matched) == (3 if tracking == "hybrid" else 4)
+
+
+def displaced(by_px: int, moved: Callable[[int], float], frames: int = 20) -> fg.Result:
+    """A drive to the right past planes, the left image of which is displaced from frame 6 on."""
+    with fg.Slam(PASSING_RIG, "landmark_kalman") as session:
+        for k in range(frames):
+            left, right = pair_of(list(SCENE), moved(k), 0.0)
+            step = np.eye(4)
+            step[0, 3] = moved(k) - moved(k - 1)
+            session.track(0.1 * k, (np.roll(left, by_px * (k >= 6), 1), right), step)
+        return session.result()
+
+
+@pytest.mark.parametrize("by_px", [6, -6])
+def test_a_camera_moved_beyond_any_calibration_leaves_the_other_image(by_px: int) -> None:
+    """No landmark fits the pair, and those that it would begin were at other distances."""
+    result = displaced(by_px, lambda k: 0.04 * k)
+    assert set(result.column("status")[6:]) == {"one_image"}
+    assert result.trajectory.poses[-1][0, 3] == pytest.approx(0.04 * 19, abs=0.01)
+    assert any("is not where the calibration has it" in remark for remark in result.remarks)
+
+
+def test_a_displaced_pair_begins_no_map_where_no_image_shows_the_old_one() -> None:
+    """The camera jumps to where nothing is known: by odometry alone."""
+    result = displaced(6, lambda k: 0.04 * k + 5.0 * (k >= 12))
+    assert set(result.column("status")[12:]) == {"camera_fault"}
+    assert result.trajectory.poses[-1][0, 3] == pytest.approx(0.04 * 19 + 5.0, abs=0.05)
+
+
+def test_a_displaced_pair_for_one_frame_leaves_the_rest_as_it_is() -> None:
+    with fg.Slam(PASSING_RIG, "landmark_kalman") as session:
+        for k in range(12):
+            left, right = pair_of(list(SCENE), 0.04 * k, 0.0)
+            session.track(0.1 * k, (np.roll(left, 6 * (k == 6), 1), right))
+        result = session.result()
+    status = result.column("status").tolist()
+    assert status[6] == "one_image"
+    assert set(status[7:]) == {"ok"}

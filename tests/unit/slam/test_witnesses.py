@@ -154,6 +154,18 @@ def test_scales_that_differ_by_less_than_a_frame_shows_are_both_held() -> None:
     assert off < 3.0 * np.sqrt(np.trace(found.online_covariances[-1][3:, 3:]))
 
 
+def test_a_difference_of_scales_beyond_noise_is_held_before_it_is_named() -> None:
+    """Of three percent none may be a fault, but one of both is off by so much."""
+    variances = []
+    for ratio in (1.0, 1.04):
+        with driven(lambda k, _, by=ratio: 0.1 * by, moved=lambda k: 0.1 * k) as session:
+            found = session.result()
+        assert codes(found) == []
+        variances.append((found.covariances[-1][3, 3], found.online_covariances[-1][3, 3]))
+    apart = 0.04 * 0.1 * (FRAMES - 1)
+    assert (np.diff(variances, axis=0) > (0.5 * apart) ** 2).all()
+
+
 def test_odometry_of_a_standing_robot_has_no_scale() -> None:
     """It is noise alone, and images show nothing of it: no scale of zero."""
     with driven(moved=lambda k: 0.0) as session:
