@@ -222,10 +222,11 @@ def fixed_point(
     for kind in {single.kind: None for single in singles}:
         own = [single for single in singles if single.kind == kind]
         drifts = np.array([nearest_positive(singles[-1].drift - one.drift) for one in own])
-        columns = (np.array([getattr(one, name) for one in own]) for name in _COLUMNS)
+        wTs, values, noise = (np.array([getattr(one, name) for one in own]) for name in _COLUMNS)
         model, parameters, spread = models[kind]
-        at = slice(len(known), len(known) + len(spread))
-        groups.append((model, parameters, at, len(own), *columns, drifts))
+        at, by = slice(len(known), len(known) + len(spread)), shifted(model, values)
+        drifts = congruence(adjoint(inverse(wTs)), drifts)
+        groups.append((model, parameters, at, len(own), wTs, values, noise, drifts, by))
         known = block_diagonal(known, np.asarray(np.linalg.inv(spread))[None])
 
     def linear(unknown: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -233,17 +234,16 @@ def fixed_point(
         hessian, gradient = np.tile(known, (n, 1, 1)), unknown @ known
         cost = np.einsum("ni,ni->n", gradient, unknown)
         for model, parameters, own, k, *columns in groups:
-            wTs, values, noise, drift = (np.concatenate([c] * n) for c in columns)
+            wTs, values, noise, drift, shifts = (np.concatenate([c] * n) for c in columns)
             at = np.repeat(unknown, k, axis=0)
             rows = linearise(model, wTs, at[:, :3], values)
-            since = congruence(rows.by_pose @ adjoint(inverse(wTs)), drift)
             by = np.zeros((*values.shape, d))
-            by[:, :, :3], by[:, :, own] = rows.by_point, shifted(model, values)
-            weight = np.linalg.inv(noise + since)
-            off = rows.residual + products(by[:, :, own], at[:, own] + parameters)
-            turned = np.swapaxes(by, 1, 2) @ weight
-            hessian += (turned @ by).reshape(n, k, d, d).sum(axis=1)
-            gradient += products(turned, off).reshape(n, k, d).sum(axis=1)
+            by[:, :, :3], by[:, :, own] = rows.by_point, shifts
+            weight = np.linalg.inv(noise + congruence(rows.by_pose, drift))
+            off = rows.residual + products(shifts, at[:, own] + parameters)
+            turned = np.swapaxes((weight @ by).reshape(n, -1, d), 1, 2)
+            hessian += turned @ by.reshape(n, -1, d)
+            gradient += products(turned, off.reshape(n, -1))
             squared = np.einsum("ki,kij,kj->k", off, weight, off)
             cost += np.where(rows.usable, squared, np.inf).reshape(n, k).sum(axis=1)
         return hessian, gradient, cost

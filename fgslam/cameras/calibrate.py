@@ -215,14 +215,26 @@ def _turn_of(matrix: FloatArray) -> FloatArray:
 # The least squares
 
 
-def _predicted(seen: _Sightings, values: _Values, size: tuple[int, int], model: str) -> FloatArray:
-    """(n, 2) pixels of all corners; NaN where the lens does not show them."""
+def _placed(seen: _Sightings, values: _Values) -> FloatArray:
+    """(n, 3) all corners in the axes of the cameras that see them."""
     points = seen.points
     for turns, which in ((values.boards, seen.view), (values.turns, seen.camera)):
         rotations = np.full((len(turns), 3, 3), np.nan)
         known = np.isfinite(turns).all(axis=1)
         rotations[known] = Rotation.from_rotvec(turns[known, :3]).as_matrix()
         points = np.einsum("nij,nj->ni", rotations[which], points) + turns[which, 3:]
+    return points
+
+
+def _predicted(
+    seen: _Sightings,
+    values: _Values,
+    size: tuple[int, int],
+    model: str,
+    points: FloatArray | None = None,
+) -> FloatArray:
+    """(n, 2) pixels of all corners, or of points (n, 3); NaN where the lens does not show them."""
+    points = _placed(seen, values) if points is None else points
     out = np.empty((len(points), 2))
     for camera, numbers in enumerate(values.intrinsics):
         own = seen.camera == camera
@@ -264,9 +276,9 @@ class _Fit:
         turns = np.concatenate([np.zeros(6), turns]).reshape(-1, 6)
         return _Values(intrinsics.reshape(self.values.intrinsics.shape), turns, every)
 
-    def predicted(self, x: FloatArray) -> FloatArray:
-        """(n, 2) pixels."""
-        return _predicted(self.seen, self.parts(x), self.size, self.model)
+    def predicted(self, x: FloatArray, points: FloatArray | None = None) -> FloatArray:
+        """(n, 2) pixels of the corners, or of points (n, 3) in the cameras' axes."""
+        return _predicted(self.seen, self.parts(x), self.size, self.model, points)
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """(2n,) pixels, predicted minus found; the image's diagonal where the lens shows none."""
@@ -277,15 +289,25 @@ class _Fit:
         """Information (p, p) and its right side (p,), by central differences.
 
         A corner depends on one camera, its turn and one board: the k-th parameter of all cameras,
-        or of all boards, is moved at once; corners of an image share their parameters.
+        or of all boards, is moved at once; corners of an image share their parameters. Turns and
+        boards move the corner in the camera's axes, whose projection is differentiated once.
         """
         n, step = len(self.seen.pixels), _STEP * np.maximum(1.0, np.abs(x))
-        slopes = np.zeros((n, 2, self.columns.shape[1]))
+        slopes, points = np.zeros((n, 2, self.columns.shape[1])), _placed(self.seen, self.parts(x))
+        by_axis = [self.predicted(x, points + by) - self.predicted(x, points - by)
+                   for by in _STEP * np.eye(3)]  # fmt: skip
+        by_point = np.stack(by_axis, axis=2) / (2.0 * _STEP)
         for k, column in enumerate(self.columns.T):
             of = np.flatnonzero(column >= 0)
+            if not len(of):
+                continue
             change = np.zeros(len(x))
             change[column[of]] = step[column[of]]
-            moved = self.predicted(x + change) - self.predicted(x - change)
+            if k < self.values.intrinsics.shape[1]:
+                moved = self.predicted(x + change, points) - self.predicted(x - change, points)
+            else:
+                ahead, behind = (_placed(self.seen, self.parts(to)) for to in (x + change, x - change))
+                moved = np.einsum("nij,nj->ni", by_point, ahead - behind)
             slope = moved[of] / (2.0 * step[column[of]])[:, None]
             slopes[of, :, k] = np.where(np.isfinite(slope), slope, 0.0)
         off = self.residuals(x).reshape(n, 2)
@@ -476,7 +498,7 @@ def _misfit(camera: RawCamera, points: Sequence[FloatArray], pixels: Sequence[Fl
             continue
         distance = np.linalg.norm(camera.project(transform_to_world(cTb, flat)) - seen, axis=1)
         off.append(float(np.median(np.where(np.isfinite(distance), distance, np.inf))))
-    return float(np.mean(np.minimum(off, max(camera.size))))
+    return float(np.median(np.minimum(off, max(camera.size))))
 
 
 def camera_of(

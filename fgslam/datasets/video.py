@@ -389,7 +389,7 @@ class VideoFrames:
 
 _GIF_FPS = 10.0  # what viewers show at least; more only makes the file larger
 _GIF_WIDTHS = (720, 560, 440, 360)
-_GIF_BYTES = 3_000_000  # what pages and READMEs take: a larger one is made narrower
+GIF_BYTES = 3_000_000  # what pages and READMEs take: a larger one is made narrower
 
 
 def require_film_suffix(path: Path) -> None:
@@ -469,6 +469,6 @@ def _write_gif(path: Path, frames: Iterable[Image], fps: float) -> int:
         first, *rest = (page.quantize(64) for page in smaller)
         duration = round(1000.0 * step / fps)
         first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
-        if path.stat().st_size < _GIF_BYTES:
+        if path.stat().st_size < GIF_BYTES:
             break
     return len(pages)

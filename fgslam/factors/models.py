@@ -56,6 +56,10 @@ class Range(LandmarkModel):
         distance = np.linalg.norm(x, axis=1, keepdims=True)
         return np.where(distance > _NEAREST_M, distance, np.nan)
 
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """(k, 1, 3) unit vectors to the landmarks."""
+        return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))[:, None]
+
     def factor(self, keys: list[int], z: FloatArray, noise: Any, xTs: FloatArray) -> Any:
         """GTSAM's."""
         return gtsam.RangeFactorWithTransform3D(keys[0], keys[1], z[0], noise, gtsam.Pose3(xTs))

@@ -304,7 +304,11 @@ def test_held_out_images_and_coverage() -> None:
     assert held_out_alone(BOARD, views[:8], true.size, true.model) is None
 
 
-def test_too_few_views_and_boards_that_are_all_far_are_refused() -> None:
+def test_too_few_views_and_boards_that_are_all_far_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The latter whether or not the fit has come to an end."""
+    monkeypatch.setattr(module, "MOST_STEPS", 30)
     views = views_of("fisheye", 0, count=12)
     size = CAMERAS["fisheye"].size
     with pytest.raises(CalibrationError, match="the camera shows the board in 4 images"):

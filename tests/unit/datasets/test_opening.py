@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from pydantic import TypeAdapter, ValidationError
 from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import load_rig
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FgslamError, FrameError
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
@@ -427,17 +427,17 @@ def test_a_real_drive_fits_its_calibration_and_no_other(shared_data: Path) -> No
     assert re.search(f"{other.name} does not fit these images", wrong.notes[0])
 
 
-def seen_by(camera: RawCamera, wall: Image, shift_m: float) -> Image:
-    """A textured wall 3 m away, 5 mm a pixel, by a camera ``shift_m`` to the right."""
+def seen_by(camera: RawCamera, wall: Image, shifts_m: FloatArray) -> Iterator[Image]:
+    """A textured wall 3 m away, 5 mm a pixel, by a camera each of ``shifts_m`` to the right."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
-    place = (3.0 * rays[:, :2] / rays[:, 2:] + [shift_m, 0.0]) / 0.005 + 700.0
-    u, v = place.T.reshape(2, *columns.shape).astype(np.float32)
-    return np.asarray(cv2.remap(wall, u, v, cv2.INTER_LINEAR), np.uint8)
+    for shift in shifts_m:
+        place = (3.0 * rays[:, :2] / rays[:, 2:] + [shift, 0.0]) / 0.005 + 700.0
+        u, v = place.T.reshape(2, *columns.shape).astype(np.float32)
+        yield np.asarray(cv2.remap(wall, u, v, cv2.INTER_LINEAR), np.uint8)
 
 
-@pytest.mark.parametrize("model", ["radtan", "equidistant"])
-@pytest.mark.parametrize("matrices", ["K", "M"])
+@pytest.mark.parametrize(("model", "matrices"), [("radtan", "K"), ("equidistant", "M")])
 def test_four_coefficients_are_of_the_lens_by_which_rows_agree(
     tmp_path: Path, model: str, matrices: str
 ) -> None:
@@ -452,9 +452,8 @@ def test_four_coefficients_are_of_the_lens_by_which_rows_agree(
     values: dict[str, Any] = {"image_size": size, "R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0]}
     for k, (side, shift) in enumerate((("left", 0.0), ("right", 0.2))):
         camera = RawCamera(*size, matrix, distortions[k], np.eye(4), model=model)
-        for frame in range(3):
-            name = f"{frame:06d}.png"
-            save(tmp_path / side / name, seen_by(camera, wall, shift + 0.3 * frame))
+        for frame, image in enumerate(seen_by(camera, wall, shift + 0.3 * np.arange(3))):
+            save(tmp_path / side / f"{frame:06d}.png", image)
         values |= {f"{matrices}{k + 1}": matrix.tolist(), f"D{k + 1}": distortions[k].tolist()}
     (tmp_path / "calib.json").write_text(json.dumps(values), encoding="utf-8")
     (tmp_path / "times.txt").write_text("".join(f"{k} {k / 10}\n" for k in range(3)), "utf-8")
