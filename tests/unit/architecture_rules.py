@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -105,14 +105,9 @@ class Module:
     is_package: bool
 
     @cached_property
-    def placed(self) -> tuple[tuple[ast.AST, bool, bool], ...]:
-        """All nodes of the tree, found once; whether in a function, and for type checkers only."""
-        return tuple(_walk_with_context(self.tree))
-
-    @property
-    def nodes(self) -> Iterator[ast.AST]:
-        """All of the tree."""
-        return (node for node, _, _ in self.placed)
+    def nodes(self) -> tuple[ast.AST, ...]:
+        """All of the tree, found once."""
+        return tuple(ast.walk(self.tree))
 
     @property
     def code_lines(self) -> int:
@@ -189,25 +184,28 @@ def package_violations(modules: list[Module]) -> Iterator[Violation]:
 def imports_of(module: Module, modules: list[Module]) -> Iterator[Import]:
     """What a module imports, wherever in it; ``from a import b`` means ``a.b`` if that exists."""
     known = {m.name for m in modules}
-    for node, lazy, typing in module.placed:
-        if isinstance(node, ast.Import | ast.ImportFrom | ast.Call):
-            for target in _targets(node, module, known):
-                yield Import(target, node.lineno, lazy, typing)
+    called = "import_module" in module.source  # else none of its expressions imports
+    for node, lazy, typing in _walk_with_context(module.tree, called):
+        for target in _targets(node, module, known):
+            yield Import(target, node.lineno, lazy, typing)
 
 
-def _walk_with_context(tree: ast.Module) -> Iterator[tuple[ast.AST, bool, bool]]:
+def _walk_with_context(
+    tree: ast.Module, expressions: bool
+) -> Iterator[tuple[ast.stmt | ast.expr, bool, bool]]:
     stack: list[tuple[ast.AST, bool, bool]] = [(tree, False, False)]
     while stack:
         node, lazy, typing = stack.pop()
-        yield node, lazy, typing
+        if isinstance(node, ast.expr) and not expressions:
+            continue
+        if isinstance(node, ast.stmt | ast.expr):
+            yield node, lazy, typing
         lazy = lazy or isinstance(node, FunctionNode | ast.Lambda)
         if isinstance(node, ast.If) and _names_type_checking(node.test):
             stack += [(child, lazy, True) for child in node.body]
             stack += [(child, lazy, typing) for child in node.orelse]
-        else:  # as `ast.iter_child_nodes`, in a third of its time
-            for value in vars(node).values():
-                children = value if isinstance(value, list) else (value,)
-                stack += [(child, lazy, typing) for child in children if isinstance(child, ast.AST)]
+        else:
+            stack += [(child, lazy, typing) for child in ast.iter_child_nodes(node)]
 
 
 def _names_type_checking(test: ast.expr) -> bool:
@@ -421,7 +419,7 @@ def private_name_violations(tests: Path, modules: list[Module]) -> list[Violatio
     return found
 
 
-def _defined_names(nodes: Iterable[ast.AST]) -> Iterator[str]:
+def _defined_names(nodes: tuple[ast.AST, ...]) -> Iterator[str]:
     """Names of functions, classes, variables and attributes that a module defines."""
     for node in nodes:
         if isinstance(node, FunctionNode | ast.ClassDef):
