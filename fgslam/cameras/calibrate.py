@@ -109,7 +109,7 @@ def calibrate(
         _require_views(seen, used)
         fit = _Fit(seen.select(used), values, size, model)
         values, sigmas = fit.solution()
-        away = np.linalg.norm(_predicted(seen, values, size, model) - seen.pixels, axis=1)
+        away = _away(seen, values, size, model)
         # Distances beyond five robust deviations of all are left out; what an earlier, worse fit
         # left out comes back where it fits now.
         known = away[np.isfinite(away)]
@@ -227,19 +227,20 @@ def _placed(seen: _Sightings, values: _Values) -> FloatArray:
 
 
 def _predicted(
-    seen: _Sightings,
-    values: _Values,
-    size: tuple[int, int],
-    model: str,
-    points: FloatArray | None = None,
+    seen: _Sightings, values: _Values, size: tuple[int, int], model: str, points: FloatArray
 ) -> FloatArray:
-    """(n, 2) pixels of all corners, or of points (n, 3); NaN where the lens does not show them."""
-    points = _placed(seen, values) if points is None else points
+    """(n, 2) pixels of :func:`_placed` points (n, 3); NaN where the lens does not show them."""
     out = np.empty((len(points), 2))
     for camera, numbers in enumerate(values.intrinsics):
         own = seen.camera == camera
         out[own] = camera_of(model, size, numbers).project(points[own])
     return out
+
+
+def _away(seen: _Sightings, values: _Values, size: tuple[int, int], model: str) -> FloatArray:
+    """(n,) pixels from where the corners are predicted to where they were found."""
+    predicted = _predicted(seen, values, size, model, _placed(seen, values))
+    return np.asarray(np.linalg.norm(predicted - seen.pixels, axis=1))
 
 
 class _Fit:
@@ -276,13 +277,14 @@ class _Fit:
         turns = np.concatenate([np.zeros(6), turns]).reshape(-1, 6)
         return _Values(intrinsics.reshape(self.values.intrinsics.shape), turns, every)
 
-    def predicted(self, x: FloatArray, points: FloatArray | None = None) -> FloatArray:
-        """(n, 2) pixels of the corners, or of points (n, 3) in the cameras' axes."""
-        return _predicted(self.seen, self.parts(x), self.size, self.model, points)
+    def predicted(self, values: _Values, points: FloatArray) -> FloatArray:
+        """(n, 2) pixels of points (n, 3) in the cameras' axes."""
+        return _predicted(self.seen, values, self.size, self.model, points)
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """(2n,) pixels, predicted minus found; the image's diagonal where the lens shows none."""
-        off = self.predicted(x) - self.seen.pixels
+        values = self.parts(x)
+        off = self.predicted(values, _placed(self.seen, values)) - self.seen.pixels
         return np.asarray(np.where(np.isfinite(off), off, np.hypot(*self.size))).ravel()
 
     def normal_equations(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -292,22 +294,24 @@ class _Fit:
         or of all boards, is moved at once; corners of an image share their parameters. Turns and
         boards move the corner in the camera's axes, whose projection is differentiated once.
         """
-        n, step = len(self.seen.pixels), _STEP * np.maximum(1.0, np.abs(x))
-        slopes, points = np.zeros((n, 2, self.columns.shape[1])), _placed(self.seen, self.parts(x))
-        by_axis = [self.predicted(x, points + by) - self.predicted(x, points - by)
-                   for by in _STEP * np.eye(3)]  # fmt: skip
-        by_point = np.stack(by_axis, axis=2) / (2.0 * _STEP)
+        seen, values, step = self.seen, self.parts(x), _STEP * np.maximum(1.0, np.abs(x))
+        points, n = _placed(seen, values), len(seen.pixels)
+        slopes, by_point = np.zeros((n, 2, self.columns.shape[1])), np.empty((n, 2, 3))
+        for axis, by in enumerate(_STEP * np.eye(3)):
+            moved = self.predicted(values, points + by) - self.predicted(values, points - by)
+            by_point[:, :, axis] = moved / (2.0 * _STEP)
         for k, column in enumerate(self.columns.T):
             of = np.flatnonzero(column >= 0)
             if not len(of):
                 continue
             change = np.zeros(len(x))
             change[column[of]] = step[column[of]]
-            if k < self.values.intrinsics.shape[1]:
-                moved = self.predicted(x + change, points) - self.predicted(x - change, points)
+            ahead, behind = self.parts(x + change), self.parts(x - change)
+            if k < values.intrinsics.shape[1]:
+                moved = self.predicted(ahead, points) - self.predicted(behind, points)
             else:
-                ahead, behind = (_placed(self.seen, self.parts(to)) for to in (x + change, x - change))
-                moved = np.einsum("nij,nj->ni", by_point, ahead - behind)
+                way = _placed(seen, ahead) - _placed(seen, behind)
+                moved = np.einsum("nij,nj->ni", by_point, way)
             slope = moved[of] / (2.0 * step[column[of]])[:, None]
             slopes[of, :, k] = np.where(np.isfinite(slope), slope, 0.0)
         off = self.residuals(x).reshape(n, 2)
@@ -489,7 +493,10 @@ def first_guess(
 
 
 def _misfit(camera: RawCamera, points: Sequence[FloatArray], pixels: Sequence[FloatArray]) -> float:
-    """Median over all images of how far off their corners are, pixels, with the boards placed."""
+    """Mean logarithm of how far off each image's corners are, with the boards placed.
+
+    Of pixels the mean would follow one image that shows no such board.
+    """
     off = []
     for flat, seen in zip(points, pixels, strict=True):
         cTb = board_pose(camera, flat, seen)
@@ -498,7 +505,7 @@ def _misfit(camera: RawCamera, points: Sequence[FloatArray], pixels: Sequence[Fl
             continue
         distance = np.linalg.norm(camera.project(transform_to_world(cTb, flat)) - seen, axis=1)
         off.append(float(np.median(np.where(np.isfinite(distance), distance, np.inf))))
-    return float(np.median(np.minimum(off, max(camera.size))))
+    return float(np.mean(np.log(np.clip(off, 1.0, max(camera.size)))))
 
 
 def camera_of(
@@ -673,7 +680,7 @@ def held_out_alone(
     values = _Fit(placed, _Values(numbers, np.zeros((1, 6)), boards), size, model).least(
         _FIRST_STEPS, fixed_from=0
     )
-    away = np.linalg.norm(_predicted(placed, values, size, model) - placed.pixels, axis=1)
+    away = _away(placed, values, size, model)
     kept = np.unique(placed.image)
     off_px = float(np.median(away)) / _MEDIAN_OF_RAYLEIGH * np.sqrt(2.0)
     each = np.array([_rms(away[placed.image == k]) for k in kept])
