@@ -48,6 +48,7 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     point_pose_jacobian,
+    se3_log,
     skew,
     transform_to_camera,
 )
@@ -181,22 +182,26 @@ _LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
 _LEAST_DISPARITY_PX = 0.5  # farther points are known no better than their noise
 _LEAST_INFORMATION = 1e-9  # of the mean, in directions that the matches leave open
 _NONE = np.zeros((6, 6))
+_INSTANT_S = 1e-6  # between frames, at least
 
 
 class RigTerms:
     """The terms in SHARED of a rig that calibrates itself, then the modes of its field: unknown.
 
-    Of a rig that is taken as stated TERMS are, too; of one that is exact none.
+    Of a rig that is taken as stated TERMS are, too; of one that is exact none. The last one is the
+    read-out of a rig whose rows are not of one moment.
     """
 
     deviations: Kept[FloatArray | None]
+    _path: Kept[list[tuple[float, FloatArray]]]  # stamps and poses, the last two
     _applied: Kept[FloatArray]
     _field_px: Kept[float]
 
     def __init__(self, sensor: CameraRig) -> None:
         """Those of a rig that is not exact."""
         self.rig = None if sensor.exact else sensor
-        self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig))
+        self._late, self._path = int(sensor.readout_s > 0.0), []
+        self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig)) + self._late
         """How many there are, q."""
         self.deviations = None
         """(q, q) lower root of their covariance; None: they are known."""
@@ -212,20 +217,30 @@ class RigTerms:
         """(q, q) of the terms; None: they are known."""
         return None if self.deviations is None else self.deviations @ self.deviations.T
 
-    def update(self, increment: Increment) -> None:
-        """Takes in the correction that a frame's measurements contain, and the field's size."""
+    def update(self, increment: Increment, wTc: FloatArray) -> bool:
+        """Takes in a frame's pose, the correction in its measurements, and the field's size.
+
+        False where rows are not of one moment, and it is not known yet how the camera moves.
+        """
+        self._path = [*self._path[-1:], (increment.timestamp, wTc)]
         known = increment.settled_rig
         self._hear(increment.rig_correction, 0.0 if known is None else known.field_px)
+        return len(self._path) > self._late
 
-    def shifts(self, measured: FloatArray) -> FloatArray:
-        """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero where known."""
+    def shifts(self, measured: FloatArray, by_pose: FloatArray) -> FloatArray:
+        """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero where known.
+
+        ``by_pose`` (k, 3, 6) is their derivative by the frame's pose.
+        """
         if self.rig is None or self.deviations is None:
             return np.zeros((len(measured), 3, self.count))
         pixels = pixels_of(self.rig, measured)
         of_pixels = [shared_displacements(self.rig, pixels), field_displacements(self.rig, pixels)]
         if self.rig.stated:
             of_pixels.append(displacements(self.rig, pixels))
-        return fused(self.rig, np.concatenate(of_pixels, axis=2))
+        rates = rates_of(*map(np.array, zip(*self._path, strict=True)))[-1:]
+        late = read_late(self.rig, measured, by_pose, rates)[..., : self._late]
+        return np.concatenate([fused(self.rig, np.concatenate(of_pixels, axis=2)), late], axis=2)
 
     def _hear(self, correction: FloatArray | None, field_px: float) -> None:
         """Both change seldom."""
@@ -241,6 +256,8 @@ class RigTerms:
         if self.rig.stated:
             own = slice(-len(correction), None)
             self.deviations[own, own] = np.linalg.cholesky(none.covariance)
+        if self._late:
+            self.deviations[-1, -1] = self.rig.readout_s
 
 
 class ConsiderCovariance(ErrorColumns):
@@ -251,6 +268,7 @@ class ConsiderCovariance(ErrorColumns):
 
     _terms: Kept[RigTerms]
     _wTc: Kept[FloatArray | None]
+    _waiting: Kept[list[tuple[Increment, FloatArray]]]
 
     def __init__(self, sensor: CameraRig, floor: Floor) -> None:
         """The first pose is known, the map empty.
@@ -263,7 +281,7 @@ class ConsiderCovariance(ErrorColumns):
         self._terms = RigTerms(sensor)
         super().__init__(self._terms.count, information=np.empty((0, 3, 3)))
         self._floor = floor
-        self._wTc = None
+        self._wTc, self._waiting = None, []
 
     @property
     def present(self) -> bool:
@@ -272,7 +290,12 @@ class ConsiderCovariance(ErrorColumns):
 
     def observe(self, increment: Increment, wTc: FloatArray) -> None:
         """Takes in a frame: its accepted measurements and its pose as estimated."""
-        self._terms.update(increment)
+        self._waiting.append((increment, wTc))
+        if self._terms.update(increment, wTc):
+            while self._waiting:  # a first frame's rows tell of a motion that the next one shows
+                self._take_in(*self._waiting.pop(0))
+
+    def _take_in(self, increment: Increment, wTc: FloatArray) -> None:
         rig = self._terms.rig
         if rig is None or not self.present:
             return
@@ -329,26 +352,47 @@ class ConsiderCovariance(ErrorColumns):
         columns, information = self._at(rows)
         pull, added = seen.landmark_information()
         information = information + added
-        off = seen.off(self._pose_columns) - seen.by_point @ columns
+        off = seen.left(self._pose_columns) - seen.by_point @ columns
         self._map["columns"][rows] = columns + np.linalg.solve(information, pull @ off)
         self._map["information"][rows] = information
 
     def _add(self, seen: _Linearised) -> None:
         """Landmarks where their first measurement has them; identities ascend."""
         if len(seen.ids):
-            columns = np.linalg.solve(seen.by_point, seen.off(self._pose_columns))
+            columns = np.linalg.solve(seen.by_point, seen.left(self._pose_columns))
             information = seen.landmark_information()[1]
             self.append({"ids": seen.ids, "columns": columns, "information": information})
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class _Linearised(Rows):
+class ObservedColumns(Rows):
+    """Measurements (k) of landmarks in a frame, linearised at the landmarks: error columns."""
+
+    by_pose: FloatArray
+    by_point: FloatArray
+    shift: FloatArray
+
+    def off(self, points: FloatArray) -> FloatArray:
+        """(k, 3, m) how far they are from where landmarks with errors (k, 3, m) have them."""
+        return np.asarray(self.shift - self.by_point @ points)
+
+    def placed(self, pose: FloatArray) -> FloatArray:
+        """(k, 3, m) where a camera with errors (6, m) has the points."""
+        off = self.shift - (self.by_pose.reshape(-1, 6) @ pose).reshape(self.shift.shape)
+        return np.asarray(np.linalg.inv(self.by_point) @ off)
+
+    def following(self, by_measurement: FloatArray, points: FloatArray) -> FloatArray:
+        """(6, m) of a pose with this derivative (k, 6, 3) by the measurements."""
+        off = self.off(points)
+        gain = np.swapaxes(by_measurement, 0, 1).reshape(6, -1)
+        return np.asarray(gain @ off.reshape(gain.shape[1], off.shape[2]))
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class _Linearised(ObservedColumns):
     """Measurements (k) of a frame, linearised where they have their points."""
 
     ids: IntArray
-    shift: FloatArray
-    by_pose: FloatArray
-    by_point: FloatArray
     covariance: FloatArray
 
     @staticmethod
@@ -357,10 +401,10 @@ class _Linearised(Rows):
         projection = rig.jacobian(points)
         by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
         by_point = projection @ wTc[:3, :3].T
-        shift = terms.shifts(seen.measurement)
-        return _Linearised(seen.ids, shift, by_pose, by_point, seen.covariance)
+        shift = terms.shifts(seen.measurement, by_pose)
+        return _Linearised(by_pose, by_point, shift, seen.ids, seen.covariance)
 
-    def off(self, pose_columns: FloatArray) -> FloatArray:
+    def left(self, pose_columns: FloatArray) -> FloatArray:
         """(k, 3, q) what of the measurements' shifts the pose does not follow."""
         return np.asarray(self.shift - self.by_pose @ pose_columns)
 
@@ -395,6 +439,26 @@ def pixels_of(rig: CameraRig, measured: FloatArray) -> FloatArray:
 def fused(rig: CameraRig, of_pixels: FloatArray) -> FloatArray:
     """(k, 3, n) of measurements, by displacements of their pixels (k, 2 * cameras, n)."""
     return np.asarray(rig_map(rig) @ of_pixels)
+
+
+def rates_of(stamps: FloatArray, poses: FloatArray) -> FloatArray:
+    """(n, 6) tangent vectors a second at poses, from the one before to the one after; 0 of one."""
+    at = np.arange(len(poses))
+    first, then = np.maximum(at - 1, 0), np.minimum(at + 1, len(at) - 1)
+    seconds = np.maximum(stamps[then] - stamps[first], _INSTANT_S)
+    return np.array(list(map(se3_log, inverse(poses[first]) @ poses[then]))) / seconds[:, None]
+
+
+def read_late(
+    rig: CameraRig, measured: FloatArray, by_pose: FloatArray, rates: FloatArray
+) -> FloatArray:
+    """(k, 3, 1) by which a second from the first row to the last displaces measurements (k, 3).
+
+    By their derivatives (k, 3, 6), and the poses' rates (k, 6) or (1, 6). The middle row is of the
+    pose's moment.
+    """
+    late = measured[:, 1, None, None] / rig.height - 0.5
+    return np.asarray(late * (by_pose @ rates[:, :, None]))
 
 
 def shared_covariance(correction: RigCorrection) -> FloatArray:
@@ -477,30 +541,6 @@ class TrackedStep:
         return carried, pose.covariance - congruence(carried, self.before.covariance)
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ObservedColumns(Rows):
-    """Measurements (k) of landmarks in a frame, linearised at the landmarks: error columns."""
-
-    by_pose: FloatArray
-    by_point: FloatArray
-    shift: FloatArray
-
-    def off(self, points: FloatArray) -> FloatArray:
-        """(k, 3, m) how far they are from where landmarks with errors (k, 3, m) have them."""
-        return np.asarray(self.shift - self.by_point @ points)
-
-    def placed(self, pose: FloatArray) -> FloatArray:
-        """(k, 3, m) where a camera with errors (6, m) has the points."""
-        off = self.shift - (self.by_pose.reshape(-1, 6) @ pose).reshape(self.shift.shape)
-        return np.asarray(np.linalg.inv(self.by_point) @ off)
-
-    def following(self, by_measurement: FloatArray, points: FloatArray) -> FloatArray:
-        """(6, m) of a pose with this derivative (k, 6, 3) by the measurements."""
-        off = self.off(points)
-        gain = np.swapaxes(by_measurement, 0, 1).reshape(6, -1)
-        return np.asarray(gain @ off.reshape(gain.shape[1], off.shape[2]))
-
-
 class SampledErrors(ErrorColumns):
     """Columns by what is unknown of the rig, then by SAMPLES draws of all noise."""
 
@@ -536,7 +576,7 @@ class SampledErrors(ErrorColumns):
         if self._off:
             return
         self._random = np.random.default_rng((_STREAM, step.frame))
-        self._terms.update(step.increment)
+        self._terms.update(step.increment, step.tracking.wTc)
         learn_from(self._noise, step.frame, step.increment, step.tracking, step.before.wTc)
         self._taken = step.tracking.noise
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
@@ -694,9 +734,9 @@ class SampledErrors(ErrorColumns):
         points = transform_to_camera(wTc, seen.points)
         projection = self._sensor.jacobian(points)
         shift = np.zeros((len(seen), 3, self._count + SAMPLES))
-        shift[:, :, : self._count] = self._terms.shifts(seen.measurement)
-        shift[:, :, self._count :] = self._drawn(self._noise.power * seen.measurement_covariance)
         by_pose = projection @ point_pose_jacobian(points)
+        shift[:, :, : self._count] = self._terms.shifts(seen.measurement, by_pose)
+        shift[:, :, self._count :] = self._drawn(self._noise.power * seen.measurement_covariance)
         return ObservedColumns(by_pose, projection @ wTc[:3, :3].T, shift)
 
     def _signs(self, k: int, d: int) -> FloatArray:

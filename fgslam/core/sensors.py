@@ -288,6 +288,8 @@ class CameraRig(Brief):
             ``reference`` alone, where the others are measured by shifts from it.
         stated: the calibration is taken as it is, and no drive corrects it: covariances contain
             what it leaves between the cameras, too (:data:`fgslam.core.correction.TERMS`).
+        readout_s: deviation of the time from an image's first row to its last, about 0; 0 where all
+            rows are of one moment (a global shutter).
     """
 
     width: int
@@ -302,6 +304,7 @@ class CameraRig(Brief):
     exact: bool = False
     places: RigPlaces = field(default="all", repr=False)
     stated: bool = field(default=False, repr=False)
+    readout_s: float = field(default=0.0, repr=False, metadata={"sparse": True})
     angles = ()  # none of the three is one
     nuisance = ()  # its terms are considered, or found by self-calibration
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rolling_room import FOCAL, HEIGHT, WIDTH, Hand, recording
 from running import metrics_of
 
 import fgslam as fg
 from benchmarks.evidence import euroc_raw, lenses
 from benchmarks.evidence.lens_views import loaded, raw_cameras
+from fgslam.backend.considered import shared_covariance
 from fgslam.backend.settings import DEFAULT_ESTIMATOR
+from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray
+from fgslam.core.correction import RigCorrection
 from fgslam.core.geometry import se3_exp
 from fgslam.core.types import Trajectory, read_covariances
-from fgslam.evaluation.statistics import moved
+from fgslam.datasets.depth import depth_rig
+from fgslam.evaluation.statistics import chi_square_band, moved
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.settings import LabRigSettings
 
@@ -109,8 +115,37 @@ def test_a_drone_that_stands_stays_where_it_is(shared_data: Path, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.data
 def test_colour_and_depth_of_a_hand_are_located(shared_data: Path, tmp_path: Path) -> None:
-    """Fifteen blurred frames, bare; measured: all located, ATE 1.04 cm."""
+    """Fifteen blurred frames, bare; measured: all located, ATE 0.62 cm."""
     metrics = metrics_of(fg.run(shared_data / "rgbd_fr1", UNSEEN, tmp_path / "run").folder)
     counts = metrics["status_counts"]
     assert sum(counts.get(name, 0) for name in ("first", "ok", "capped", "relocalised")) >= 14
-    assert metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.015
+    assert metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.01
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_is_found_and_leaves_consistent_motions(tmp_path: Path) -> None:
+    """Rendered, rows read in up to 33 ms, calibrations as wrong as they are taken to be.
+
+    Measured: read-outs off by 0.1 to 1.8 of their deviations, ATE 0.4 to 1.6 cm (on the way, where
+    it is considered alone, 1.1 to 8), NEES of motions over five frames 1.05, without it 60 to 80.
+    """
+    matrix = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    rig = depth_rig(RawCamera(WIDTH, HEIGHT, matrix, np.zeros(4), np.eye(4), "room"))
+    covariance = shared_covariance(RigCorrection.none(rig))
+    off, motions = [], []
+    for seed in range(6):
+        readout = round(np.random.default_rng(100 + seed).uniform(0.0, 0.033), 3)
+        wrong = np.random.default_rng(seed).multivariate_normal(np.zeros(7), covariance)
+        root = recording(tmp_path / f"room_{seed}", Hand(seed), readout, off=wrong)
+        settings = UNSEEN | {"dataset.depth_scale": 5000}
+        metrics = metrics_of(fg.run(root, settings, tmp_path / f"run_{seed}").folder)
+        assert metrics["located"] == {"frames": 16, "of": 16}
+        found = metrics["estimators"][DEFAULT_ESTIMATOR]
+        words = next(remark for remark in found["remarks"] if "rolling shutter" in remark)
+        read, sigma = (float(number) for number in re.findall(r"-?\d+\.\d", words))
+        off.append((read - 1e3 * readout) / sigma)
+        motions.append(found["nees_relative"]["5"]["per_dof"])
+        assert found["ate_rmse_m"] < 0.02
+    assert np.abs(off).max() < 3.0
+    lower, upper = chi_square_band(6.0 * len(motions))
+    assert lower < np.mean(motions) < upper

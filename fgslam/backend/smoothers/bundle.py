@@ -274,8 +274,7 @@ class Turns:
 
     def cost(self, poses: FloatArray, bias: FloatArray) -> float:
         """Half the sum of squares, with what is known of the bias (3q,) beforehand."""
-        residuals = self.residuals(poses, bias)
-        return 0.5 * float((residuals**2).sum() + bias @ self.known @ bias)
+        return 0.5 * float((self.residuals(poses, bias) ** 2).sum() + bias @ self.known @ bias)
 
     def residuals(self, poses: FloatArray, bias: FloatArray) -> FloatArray:
         """(k, 6) whitened: how far each pose (n, 4, 4) is off from where its step leads."""
@@ -599,8 +598,7 @@ class WholeGraph:
 
     def weighed(self, weights: FloatArray | BoolArray) -> WholeGraph:
         """Without kernel, its observations with weights (k,)."""
-        new = np.asarray(weights, np.float64)
-        return dataclasses.replace(self, weights=new, kernel=PLAIN)
+        return dataclasses.replace(self, weights=np.asarray(weights, np.float64), kernel=PLAIN)
 
     def masked(self, rows: BoolArray) -> WholeGraph:
         """Without the other observations (k,), with its kernel."""
@@ -660,13 +658,13 @@ class WholeGraph:
         return self.seen.joined(rest, rows, weights, self._incidence)
 
     def pulled(
-        self, state: State, shifts: Callable[[FloatArray], FloatArray]
+        self, state: State, shifts: Callable[[IntArray], FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
         """What shifts of a rig's measurements do to the normal equations at a state.
 
         Args:
             state: where to linearise.
-            shifts: from measurements (k, 3) to their displacements by p parameters (k, 3, p).
+            shifts: from rows (k,) of measurements to displacements by p parameters (k, 3, p).
 
         Returns:
             Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
@@ -674,7 +672,7 @@ class WholeGraph:
         seen, rows = self.seen, self.seen.look(state.poses, state.points)
 
         def of(few: IntArray) -> FloatArray:
-            by = -seen.roots[few] @ shifts(seen.measured[few])
+            by = -seen.roots[few] @ shifts(few)
             incidence = (self._incidence[0][:, few], self._incidence[1][:, few])
             return _pulled(rows.select(few), by, self.weights[few], incidence)
 
@@ -794,8 +792,7 @@ def _pulled(
     of_points = _summed(points, np.swapaxes(rows.by_point, 1, 2) @ known)
     of_poses = _summed(poses, np.swapaxes(rows.by_pose, 1, 2) @ known)
     p = by.shape[2]
-    own = by.reshape(-1, p).T @ known.reshape(-1, p)
-    return np.concatenate([*of_points, *of_poses, own])
+    return np.concatenate([*of_points, *of_poses, by.reshape(-1, p).T @ known.reshape(-1, p)])
 
 
 def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:

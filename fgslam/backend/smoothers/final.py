@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, TypeAlias
 
@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from fgslam.backend.considered import fused, pixels_of, shared_covariance
+from fgslam.backend.considered import fused, pixels_of, rates_of, read_late, shared_covariance
 from fgslam.backend.loops import Chain, Constraint, constraint_factor, refusal
 from fgslam.backend.measured import nuisance_words
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
@@ -58,40 +58,76 @@ from fgslam.factors.graphs import number, poses_of_frame
 # What the uncertainty of a rig's calibration adds to the covariances of a solved graph
 
 
-def with_uncertain_rig(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
-    """Marginals at a solution, with the uncertainty of its rig.
+def with_uncertain_rig(found: Refined, rig: RigCorrection) -> Bordered:
+    """Marginals of a solved graph, with the uncertainty of its rig.
 
-    Its border are the correction's terms, those that all cameras share, and the field's modes.
+    Its border are the correction's terms, those that all cameras share, the field's modes, and the
+    read-out of a rig whose rows are not of one moment: by how much that is still to be changed.
 
     Args:
-        graph: the factors.
-        state: its minimum.
+        found: the graph at its minimum.
         rig: with the correction that was applied to it.
 
     Raises:
         EstimatorError: the measurements do not determine all variables.
     """
-    held, prior, shared = (
-        reduced(graph.linear(state)),
-        prior_information(rig.rig),
-        shared_covariance(rig),
-    )
+    graph, state, late = found.graph, found.state, late_rows(found)
+    held = reduced(graph.linear(state))
+    prior, shared = prior_information(rig.rig), shared_covariance(rig)
     modes = field_modes(rig.rig) if rig.field_px and not rig.rig.exact else 0
-    p, terms = len(prior), slice(len(prior) + len(shared) + modes)
-    pull, own = graph.pulled(
-        state, lambda measured: shifts(rig.rig, measured, modes > 0)[..., terms]
-    )
+    p, count = len(prior), len(prior) + len(shared) + modes
+
+    def moved(rows: IntArray) -> FloatArray:
+        of_terms = shifts(rig.rig, graph.seen.measured[rows], modes > 0)[..., :count]
+        return np.concatenate([of_terms, late[rows]], axis=2)
+
+    pull, own = graph.pulled(state, moved)
     gain = held.solve(pull)
+    information = own + pull.T @ gain[: len(pull)]
+    # The read-out is estimated as if all else were as stated, and so follows what is not.
+    known = np.eye(late.shape[2]) / rig.rig.readout_s**2
+    read = np.asarray(np.linalg.inv(information[count:, count:] + known), np.float64)
+    follows = -read @ information[count:, :count]
+    information = information[:count, :count] + information[:count, count:] @ follows
     correction = rig.covariance
     if not rig.rig.stated:  # it is known by what the drive has shown
-        information = own + pull.T @ gain[: len(pull)]
         of_terms = information[:p, :p] + prior
         correction = np.asarray(np.linalg.inv(0.5 * (of_terms + of_terms.T)), np.float64)
         # What was applied leant with the field, too: as much, but by other frames, as a graph's.
         lean = rig.field_px * correction @ information[:p, p + len(shared) :]
         correction = correction + lean @ lean.T
     covariance = np.asarray(block_diag(correction, shared, rig.field_px**2 * np.eye(modes)))
-    return Bordered(held, gain, covariance, np.zeros(len(covariance)))
+    joint = np.vstack([np.eye(count), follows])
+    covariance = joint @ covariance @ joint.T + block_diag(0.0 * covariance, read)
+    whitened = graph.weights[:, None] * graph.seen.look(state.poses, state.points).residual
+    slope = np.einsum("ki,kij,kjr->r", whitened, graph.seen.roots, late) + known @ found.read_s
+    return Bordered(held, gain, covariance, np.append(np.zeros(count), read @ slope))
+
+
+def late_rows(found: Refined) -> FloatArray:
+    """(k, 3, 1) by which a second from first to last row displaces what a graph has measured.
+
+    (k, 3, 0) where all rows are of one moment.
+    """
+    seen, state, rows = found.graph.seen, found.state, len(found.read_s)
+    look = seen.look(state.poses, state.points)
+    by_pose = np.asarray(np.linalg.solve(seen.roots, look.by_pose), np.float64)
+    rates = rates_of(found.stamps, state.poses)[seen.poses]
+    return read_late(seen.model, seen.measured, by_pose, rates)[..., :rows]
+
+
+def of_one_moment(found: Refined) -> Refined:
+    """A solved graph with measurements as if all rows were of one moment, by its own poses."""
+    try:
+        marginals = found.marginals
+    except EstimatorError:
+        return found
+    if not isinstance(marginals, Bordered):
+        return found
+    seen, more = found.graph.seen, marginals.moved[-1:]
+    seen = dataclasses.replace(seen, measured=seen.measured + late_rows(found) @ more)
+    graph = dataclasses.replace(found.graph, seen=seen)
+    return dataclasses.replace(found, graph=graph, read_s=found.read_s - more)
 
 
 def shifts(rig: CameraRig, measured: FloatArray, field: bool = False) -> FloatArray:
@@ -155,6 +191,7 @@ _NEAR_BEGINS, _NEAR_GROWS, _NEAR_ENDS = 0.3, 4.0, 20.0
 first what fits by half the gate's width counts in full, and nothing beyond twice of it."""
 _DECIDED = 1e-4
 _LEAST = 1e-12
+_READINGS = 4  # of the rows' time: each from where the last has poses
 _SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
 _BEHIND = "came out behind a camera"
 _UNSEEN = "has no observation that fits the others"
@@ -257,6 +294,9 @@ class Refined:
         state: of all variables that are left.
         remarks: what was left out, in words.
         uncertain_rig: what was applied last to a rig that calibrates itself; None for a known one.
+        stamps: (n,) of the graph's poses, seconds.
+        read_s: (1,) seconds from an image's first row to its last, which measurements are corrected
+            for; (0,) where all rows are of one moment.
         noise_ratio: variance of the measurements over what the builder takes it to be.
     """
 
@@ -264,6 +304,8 @@ class Refined:
     state: State
     remarks: tuple[str, ...] = ()
     uncertain_rig: RigCorrection | None = None
+    stamps: FloatArray = field(default_factory=lambda: np.empty(0))
+    read_s: FloatArray = field(default_factory=lambda: np.empty(0))
     noise_ratio: float = 1.0
 
     @property
@@ -295,7 +337,7 @@ class Refined:
             EstimatorError: the measurements do not determine all variables.
         """
         if self.uncertain_rig is not None and len(self.graph.seen):
-            return with_uncertain_rig(self.graph, self.state, self.uncertain_rig)
+            return with_uncertain_rig(self, self.uncertain_rig)
         return reduced(self.graph.linear(self.state))
 
     @property
@@ -321,7 +363,12 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     The observations alone are weighed again: guessed steps and the translations of a gyroscope's
     keep the noise of the way, and which landmarks lie behind a camera is not asked again.
     """
-    found = _solved(builder, values, minimise)
+    graph, state = builder.whole_graph(values)
+    rig, stamps = builder.uncertain_rig, np.array(builder.stamps)[builder.frames]
+    rolls = int(rig is not None and rig.rig.readout_s > 0.0)
+    found = _solved(builder, Refined(graph, state, (), rig, stamps, np.zeros(rolls)), minimise)
+    for _ in range(_READINGS * rolls):
+        found = _solved(builder, of_one_moment(found), minimise)
     if builder.noise.spread < _BEYOND or len(builder.frames) <= builder.frames[-1]:
         return found
     ratio = power_ratio(found.graph, found.state)
@@ -330,13 +377,12 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     return dataclasses.replace(found, graph=weighed, state=state, noise_ratio=ratio)
 
 
-def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
+def _solved(builder: GraphBuilder, found: Refined, minimise: Minimise) -> Refined:
     """Without landmarks that come out behind a camera or that nothing supports."""
-    graph, state = builder.whole_graph(values)
-    remarks: list[str] = []
+    graph, state, remarks = found.graph, found.state, list(found.remarks)
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)
-        found = Refined(kept, state, tuple(remarks), builder.uncertain_rig)
+        found = dataclasses.replace(found, graph=kept, state=state, remarks=tuple(remarks))
         lost = lost_landmarks(builder, found)
         if not lost:
             return found
@@ -344,7 +390,7 @@ def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
         rows = np.searchsorted(found.variables, sorted(lost)).astype(np.int64)
         graph, state = kept.without(rows, state)
     state, kept = minimise(graph, state)
-    return Refined(kept, state, tuple(remarks), builder.uncertain_rig)
+    return dataclasses.replace(found, graph=kept, state=state, remarks=tuple(remarks))
 
 
 class WholeGraphSolver:
@@ -484,6 +530,9 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
         return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio, nuisance=nuisance)
     bias, nuisance = refined.gyroscope, refined.nuisance
     remarks = refined.remarks if bias is None else (*refined.remarks, bias.words)
+    if len(refined.read_s) and isinstance(marginals, Bordered):
+        found = 1e3 * refined.read_s[0], 1e3 * np.sqrt(marginals.covariance[-1, -1])
+        remarks = (*remarks, "rolling shutter: rows are read in {:.1f} +- {:.1f} ms".format(*found))
     if nuisance and isinstance(marginals, Bordered):
         spread = np.diagonal(marginals.estimated)[-3 * len(nuisance) :].reshape(-1, 3)
         for (kind, values), variances in zip(nuisance.items(), spread, strict=True):

@@ -207,6 +207,7 @@ class GraphBuilder:
         self.graph = gtsam.NonlinearFactorGraph()
         self.admission = LandmarkAdmission(sensor, settings)
         self.frames: list[int] = []
+        self.stamps: list[float] = []  # of all frames, seconds
         self.measured: dict[str, Sightings] = {}
         self._waiting: dict[int, list[tuple[int, Measured]]] = {}
 
@@ -230,6 +231,7 @@ class GraphBuilder:
 
     def note(self, increment: Increment) -> None:
         """Takes in what a frame was corrected by; one without a correction changes nothing."""
+        self.stamps.append(increment.timestamp)
         if increment.rig_correction is not None:
             known = increment.settled_rig
             field_px = 0.0 if known is None else known.field_px
@@ -878,8 +880,7 @@ def _row(frames: IntArray, frame: int) -> int:
 def _as_solved(known: Constraint, frames: IntArray, poses: FloatArray) -> Constraint:
     """A constraint between rows of the graph's frames, met as the solution meets it."""
     before, after = _row(frames, known.before), _row(frames, known.after)
-    motion = inverse(poses[before]) @ poses[after]
-    return Constraint(before, after, motion, known.covariance)
+    return Constraint(before, after, inverse(poses[before]) @ poses[after], known.covariance)
 
 
 def _moved(

@@ -20,6 +20,8 @@ from fgslam.backend.considered import (
     ErrorColumns,
     SampledErrors,
     lacking,
+    rates_of,
+    read_late,
     shared_covariance,
 )
 from fgslam.backend.filters.kalman import LandmarkKalman
@@ -380,13 +382,16 @@ def displaced(increment: Any, by: FloatArray) -> Any:
 
 def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() -> None:
     refined = solved()
-    found = with_uncertain_rig(refined.graph, refined.state, EXACT)
+    found = with_uncertain_rig(refined, EXACT)
     system = refined.graph.linear(refined.state)
     poses = 6 * len(system.pose_keys)
     every = np.r_[: system.columns, -poses:0]  # without what makes a last pair
     information = system.in_pairs.toarray()[np.ix_(every, every)]
     p = len(EXACT.values)
-    pull, own = refined.graph.pulled(refined.state, lambda measured: shifts(RIG, measured)[..., :p])
+    measured = refined.graph.seen.measured
+    pull, own = refined.graph.pulled(
+        refined.state, lambda rows: shifts(RIG, measured[rows])[..., :p]
+    )
     whole = np.block([[information, pull], [pull.T, own + prior_information(RIG)]])
     covariance = np.linalg.inv(whole)
     columns, k = system.columns, len(found.covariance)
@@ -406,7 +411,7 @@ def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenths of a pixel; to first order."""
     by = (0.3 if "mode" in term else 0.1 / RIG.fx) * (np.array(ALL) == term)
     refined, moved = solved(), solved(3, tuple(by))
-    found = with_uncertain_rig(refined.graph, refined.state, UNEVEN)
+    found = with_uncertain_rig(refined, UNEVEN)
     before, after = refined.state.poses, moved.state.poses
     steps = np.array([g.se3_log(step) for step in g.inverse(before) @ after])
     gain = (found.gain[found.held.system.columns :] @ by).reshape(-1, 6)
@@ -423,7 +428,7 @@ def test_images_far_off_against_each_other_are_taken_to_be_off_as_far() -> None:
     def of(left_px: float) -> FloatArray:
         """Covariance of what is shared, the left image so far to the right."""
         moved = dataclasses.replace(CALIBRATED, values=left_px / RIG.fx * column)
-        found = with_uncertain_rig(refined.graph, refined.state, moved)
+        found = with_uncertain_rig(refined, moved)
         return found.covariance[shared, shared]
 
     np.testing.assert_allclose(of(0.3), of(0.0))
@@ -469,11 +474,11 @@ def test_rigs_that_are_off_as_assumed_leave_consistent_poses(
     for k in range(drives):
         seed = k % 12
         exact, truth = solved(seed), drawn(seed, frames=12).poses[1:]
-        assumed = with_uncertain_rig(exact.graph, exact.state, rig).covariance
+        assumed = with_uncertain_rig(exact, rig).covariance
         by = rng.multivariate_normal(np.zeros(len(assumed)), assumed)
         refined = solved(seed, tuple(np.pad(by, (0, len(ALL) - len(by)))))
         poses = refined.poses()[1:]
-        both = with_uncertain_rig(refined.graph, refined.state, rig)
+        both = with_uncertain_rig(refined, rig)
         found.append(pose_nees_per_dof(poses, both.poses()[1:], truth))
         held.append(pose_nees_per_dof(poses, both.held.poses()[1:], truth))
     assert np.mean(held) > 2.0
@@ -518,7 +523,7 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
 
 def whole(rig: RigCorrection = CALIBRATED) -> Bordered:
     refined = solved()
-    return with_uncertain_rig(refined.graph, refined.state, rig)
+    return with_uncertain_rig(refined, rig)
 
 
 @pytest.mark.parametrize("rig", [CALIBRATED, UNEVEN], ids=["terms", "field"])
@@ -641,3 +646,49 @@ def test_reported_sigmas_of_rigs_a_pixel_off_hold_errors_of_poses_and_landmarks(
     shares = [float(np.mean(each)) for each in (online, final, landmarks)]
     assert min(shares) > 0.88, shares
     assert max(shares) < 0.99, shares
+
+
+# ------------------------------------------------------------------------------------------
+# Rows that are not read at one moment
+
+
+ROLLING = dataclasses.replace(CALIBRATED.rig, readout_s=0.02)
+
+
+def test_a_moving_camera_sees_points_of_a_row_from_where_it_is_then() -> None:
+    """To first order: a hundredth of the read-out is taken, and as much of the displacement."""
+    rng, seconds = np.random.default_rng(8), 2e-4
+    points = rng.uniform([-1.0, -0.8, 1.5], [1.0, 0.8, 4.0], (40, 3))
+    rate = np.array([0.4, -1.2, 0.7, 0.2, -0.1, 0.3])
+    stamps, path = np.array([0.0, 0.1]), np.array([np.eye(4), g.se3_exp(0.1 * rate)])
+    np.testing.assert_allclose(rates_of(stamps, path), [rate, rate], atol=1e-12)
+    middle = RIG.predict(points)
+    then = np.array([g.se3_exp(rate * seconds * (r / RIG.height - 0.5)) for r in middle[:, 1]])
+    late = RIG.predict(g.transform_to_camera(then[0], points))
+    for k, wTc in enumerate(then):
+        late[k] = RIG.predict(g.transform_to_camera(wTc, points[k : k + 1]))[0]
+    by_pose = RIG.jacobian(points) @ g.point_pose_jacobian(points)
+    moved = seconds * read_late(RIG, middle, by_pose, rate[None])[:, :, 0]
+    np.testing.assert_allclose(late - middle, moved, atol=2e-3 * np.abs(moved).max())
+
+
+def test_the_first_frame_s_landmarks_wait_for_how_the_camera_moves() -> None:
+    """They lean by its motion, which one pose does not tell; then the read-out is considered.
+
+    Of a camera that turns evenly it moves little: all its images are skewed alike.
+    """
+    drive, none = drawn(3, frames=12, twist=(0.0, 0.3, 0.0, 0.01, 0.0, 0.08)), NO_FLOOR
+    seen = [dataclasses.replace(each, rig_correction=UNCORRECTED) for each in drive.increments]
+    rolling, known = ConsiderCovariance(ROLLING, none), ConsiderCovariance(CALIBRATED.rig, none)
+    for online in (rolling, known):
+        online.observe(seen[0], drive.poses[0])
+    assert not len(state_of(rolling)["order/ids"])
+    assert len(state_of(known)["order/ids"])
+    for online in (rolling, known):
+        for increment, wTc in zip(seen[1:], drive.poses[1:], strict=True):
+            online.observe(increment, wTc)
+    more = rolling.of_pose() - known.of_pose()
+    lowest, *_, highest = np.linalg.eigvalsh(more)
+    assert highest > np.deg2rad(0.01) ** 2
+    assert lowest > -1e-9 * highest
+    assert state_of(rolling)["order/ids"].tolist() == state_of(known)["order/ids"].tolist()
