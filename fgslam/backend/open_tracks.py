@@ -38,8 +38,7 @@ class Tracks:
 
 def tracks_of(counts: IntArray) -> Tracks:
     """Tracks of so many sightings (m,)."""
-    ends = np.cumsum(counts)
-    return Tracks(ends - counts, int(counts.sum()))
+    return Tracks(np.cumsum(counts) - counts, int(counts.sum()))
 
 
 class OpenTracks(GrowingColumns):

@@ -72,8 +72,7 @@ def unit_rays(bearing: FloatArray, elevation: FloatArray) -> FloatArray:
 def angles_of(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bearings and elevations (n,) of rays (n, 3), radians."""
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
-    elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
-    return bearing, elevation
+    return bearing, np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
 
 
 def measure(
@@ -167,8 +166,7 @@ def _bearing(columns: FloatArray, width: int) -> FloatArray:
 
 
 def _column(rays: FloatArray, width: int) -> FloatArray:
-    bearing = np.arctan2(rays[:, 1], rays[:, 0])
-    return (_HALF_TURN - bearing) * ((width - 1) / (2.0 * _HALF_TURN))
+    return (_HALF_TURN - np.arctan2(rays[:, 1], rays[:, 0])) * ((width - 1) / (2.0 * _HALF_TURN))
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,8 +350,7 @@ class RadialCamera(ABC):
         """(n, 3) unit rays; see :class:`OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         radius, bearing = self.frame.polar(pixels)
-        elevation = self.elevation(self._within(radius))
-        return unit_rays(bearing, elevation)
+        return unit_rays(bearing, self.elevation(self._within(radius)))
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels; see :class:`OmniCamera`."""
@@ -515,8 +512,7 @@ class RadialPolynomial(RadialCamera):
         slope = polynomial.polyder(np.array(self.coefficients))
         per_pixel = 2.0 / (self.outer_radius - self.inner_radius)
         x = _scaled(radius, self.inner_radius, self.outer_radius)
-        slopes = per_pixel * polynomial.polyval(x, slope)
-        return self.elevation(radius), np.asarray(slopes)
+        return self.elevation(radius), np.asarray(per_pixel * polynomial.polyval(x, slope))
 
 
 def _scaled(radius: FloatArray, inner: float, outer: float) -> FloatArray:
@@ -552,8 +548,7 @@ def fit_radial_polynomial(
     x = _scaled(radius, *radii)
     coefficients = polynomial.polyfit(x, elevation, degree)
     camera = RadialPolynomial(frame, *radii, coefficients=tuple(coefficients.tolist()))
-    residuals = elevation - polynomial.polyval(x, coefficients)
-    return camera, float(np.abs(residuals).max())
+    return camera, float(np.abs(elevation - polynomial.polyval(x, coefficients)).max())
 
 
 # --------------------------------------------------------------------------------------------

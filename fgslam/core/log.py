@@ -349,8 +349,7 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
             f"{path}: ids do not increase by whole numbers, or a number is not finite; run the "
             "experiment again"
         )
-    truth = LandmarkTruth(ids.astype(np.int64), values[:, 1:4].copy())
-    return truth, values[:, 4].copy()
+    return LandmarkTruth(ids.astype(np.int64), values[:, 1:4].copy()), values[:, 4].copy()
 
 
 # ------------------------------------------------------------------------------------------

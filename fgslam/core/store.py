@@ -71,8 +71,7 @@ class Resumable(Protocol):
 def pack(value: Any) -> StateArrays:
     """A value as arrays. Raises TypeError for what is neither data nor made of it."""
     packing = _Packing()
-    tree = packing.column([value], "")
-    return packing.arrays | {TREE: np.array(json.dumps(tree))}
+    return packing.arrays | {TREE: np.array(json.dumps(packing.column([value], "")))}
 
 
 def unpack(arrays: StateArrays, kind: Any) -> Any:

@@ -435,8 +435,7 @@ def in_order(rig: StereoRig) -> StereoRig:
     """The rig of images that are given as right, left[, top], whatever the file calls them."""
     if rig.rectifier is None:
         return rig
-    order = tuple(range(rig.cameras))
-    return replace(rig, rectifier=replace(rig.rectifier, order=order))
+    return replace(rig, rectifier=replace(rig.rectifier, order=tuple(range(rig.cameras))))
 
 
 def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:

@@ -73,8 +73,7 @@ class Tangent:
                 change[:, :3, :3] = bRw
         if self.unit == "degrees":
             change[:, :, :3] /= _PER_RADIAN
-        ordered = covariances[:, swap][:, :, swap]
-        return np.asarray(change @ ordered @ np.swapaxes(change, 1, 2))
+        return np.asarray(change @ covariances[:, swap][:, :, swap] @ np.swapaxes(change, 1, 2))
 
 
 def tangent_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -83,8 +82,7 @@ def tangent_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray,
     ``Log(T_est^-1 T)``; and ``Log(R_est^T R)`` with ``t - t_est``.
     """
     whole = pose_errors(estimate, truth)
-    apart = (inverse(estimate) @ truth)[:, :3, 3]
-    return whole, np.hstack([whole[:, :3], apart])
+    return whole, np.hstack([whole[:, :3], (inverse(estimate) @ truth)[:, :3, 3]])
 
 
 def guess_tangent(

@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast, get_args
+from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -147,49 +147,32 @@ def make_estimator(
     over, ``landmark_kalman_graph`` their whole cost.
     """
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
-    ego_motion = ego_motion or EgoMotionSettings()
-    return _MAKERS[settings.kind](rig, settings, prior, ego_motion)
+    make, ego_motion = _MAKERS[settings.kind](), ego_motion or EgoMotionSettings()
+    if settings.kind == "odometry":
+        return cast("Estimator", make(rig, prior))
+    mode: FloorMode | None = getattr(settings, "floor", None)
+    if mode is None:
+        return cast("Estimator", make(rig, settings, prior, ego_motion))
+    floor = make_floor(rig, mode, ego_motion.dof)
+    more = (ego_motion,) if settings.kind == "batch" else ()
+    return cast("Estimator", make(rig, settings, floor, prior, *more))
 
 
-_Maker: TypeAlias = Callable[[CameraRig, Any, Prediction, EgoMotionSettings], Estimator]
-
-
-def _on_floor(load: Callable[[], Any]) -> _Maker:
-    """What makes an estimator that keeps to a floor; its module is loaded when it is wanted."""
-
-    def make(rig: CameraRig, own: Any, prior: Prediction, ego: EgoMotionSettings) -> Estimator:
-        return cast("Estimator", load()(rig, own, make_floor(rig, own.floor, ego.dof), prior))
-
-    return make
-
-
-_MAKERS: Mapping[str, _Maker] = {
-    "odometry": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.filters.dead_reckoning"
-    ).DeadReckoning(rig, prior),
-    "landmark_kalman": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.filters.kalman"
-    ).LandmarkKalman(rig, own, prior, ego),
-    "landmark_kalman_graph": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.filters.kalman_graph"
-    ).LandmarkKalmanGraph(rig, own, prior, ego),
-    "ekf": _on_floor(lambda: import_module("fgslam.backend.filters.ekf").FullEkf),
-    "invariant_ekf": _on_floor(
-        lambda: import_module("fgslam.backend.filters.invariant_ekf").InvariantEkf
+# By kind what makes an estimator; its module is loaded when it is wanted.
+_MAKERS: Mapping[str, Callable[[], Any]] = {
+    "odometry": lambda: import_module("fgslam.backend.filters.dead_reckoning").DeadReckoning,
+    "landmark_kalman": lambda: import_module("fgslam.backend.filters.kalman").LandmarkKalman,
+    "landmark_kalman_graph": lambda: (
+        import_module("fgslam.backend.filters.kalman_graph").LandmarkKalmanGraph
     ),
-    "fast_slam": _on_floor(lambda: import_module("fgslam.backend.filters.fast_slam").FastSlam),
-    "fixed_lag": _on_floor(
-        lambda: import_module("fgslam.backend.smoothers.lag").fixed_lag_smoother
-    ),
-    "isam2": _on_floor(lambda: import_module("fgslam.backend.smoothers.isam2").isam2_smoother),
-    "sliding_window": _on_floor(
-        lambda: import_module("fgslam.backend.smoothers.lag").sliding_window_smoother
-    ),
-    "batch": lambda rig, own, prior, ego: import_module(
-        "fgslam.backend.smoothers.batch"
-    ).batch_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior, ego),
+    "ekf": lambda: import_module("fgslam.backend.filters.ekf").FullEkf,
+    "invariant_ekf": lambda: import_module("fgslam.backend.filters.invariant_ekf").InvariantEkf,
+    "fast_slam": lambda: import_module("fgslam.backend.filters.fast_slam").FastSlam,
+    "fixed_lag": lambda: import_module("fgslam.backend.smoothers.lag").fixed_lag_smoother,
+    "isam2": lambda: import_module("fgslam.backend.smoothers.isam2").isam2_smoother,
+    "sliding_window": lambda: import_module("fgslam.backend.smoothers.lag").sliding_window_smoother,
+    "batch": lambda: import_module("fgslam.backend.smoothers.batch").batch_smoother,
 }
-"""By kind what makes an estimator, at its prior pose."""
 
 
 def make_floor(rig: CameraRig, mode: FloorMode, dof: DegreesOfFreedom) -> Floor:
@@ -280,8 +263,7 @@ def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
     """Relocaliser without a prior, for the poses that the ego-motion allows."""
     from fgslam.frontend.places.relocalisation import Relocaliser
 
-    floor = Floor.under(rig, settings.ego_motion.dof)
-    return Relocaliser(rig, floor, settings.relocalisation)
+    return Relocaliser(rig, Floor.under(rig, settings.ego_motion.dof), settings.relocalisation)
 
 
 def make_locator(

@@ -109,8 +109,7 @@ class RunRecorder:
     @property
     def online(self) -> Trajectory:
         """Each pose as it was first estimated, at its own time."""
-        poses = np.array(self.online_poses).reshape(-1, 4, 4)
-        return Trajectory(self.log.timestamps, poses)
+        return Trajectory(self.log.timestamps, np.array(self.online_poses).reshape(-1, 4, 4))
 
     @property
     def seen(self) -> IntArray:

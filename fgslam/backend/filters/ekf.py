@@ -509,8 +509,7 @@ class FullEkf:
     def _blocks(self, ids: IntArray) -> IntArray:
         """Block of each landmark. KeyError for an unknown one."""
         order = np.argsort(self._ids, kind="stable")
-        known = LandmarkMap(self._ids[order], self._positions, np.empty(0))
-        return order[known.rows(ids)]
+        return order[LandmarkMap(self._ids[order], self._positions, np.empty(0)).rows(ids)]
 
     # -- what is reported, and a saved map -----------------------------------------------------
 
@@ -834,5 +833,4 @@ def rows_of(blocks: IntArray) -> IntArray:
 
 def _mirrored(lower: FloatArray) -> FloatArray:
     """Square matrices (..., k, k) of which the lower triangles count."""
-    strict = np.tril(lower, -1)
-    return np.asarray(np.tril(lower) + np.swapaxes(strict, -1, -2))
+    return np.asarray(np.tril(lower) + np.swapaxes(np.tril(lower, -1), -1, -2))

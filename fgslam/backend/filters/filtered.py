@@ -134,5 +134,4 @@ def triangulated(
     points = rig.triangulate(observed.measurement)
     kept = in_front(points)
     observed, points = observed.select(kept), points[kept]
-    covariances = rig.triangulation_covariance(observed.measurement, observed.covariance)
-    return observed, points, covariances
+    return observed, points, rig.triangulation_covariance(observed.measurement, observed.covariance)

@@ -275,8 +275,7 @@ class SeenAgain(Rows):
         )
         alone = off.fit_with(np.zeros(len(self), np.bool_), drift)
         surely = alone & off.outweigh(drift)
-        together = off.agreeing(alone, drift)
-        return np.asarray(surely | together)
+        return np.asarray(surely | off.agreeing(alone, drift))
 
 
 def _at_known_depth(
