@@ -644,7 +644,8 @@ def outcome(drive: Drive) -> Outcome:
         for t, images, odometry in zip(drive.stamps, drive.images, drive.odometry, strict=True):
             slam.track(float(t), images, odometry)
         found, parts = slam.result(), slam.pipeline.tracker.parts
-        enough = located(slam.recorder, parts, slam.pipeline.calibration).enough
+        known, misplaced = slam.pipeline.calibration, slam.pipeline.witnesses.misplaced
+        enough = located(slam.recorder, parts, known, misplaced).enough
     last = found.trajectory.poses[-1]
     n = len(drive) - len(found.trajectory.poses)
     true = inverse(drive.truth[n]) @ drive.truth[-1]

@@ -147,18 +147,27 @@ _LEAST_IN_MAP = 2.0 / 3.0  # of the frames: a map of fewer is no map of the driv
 
 
 def located(
-    recorder: RunRecorder, parts: MapParts, calibration: SelfCalibration | None = None
+    recorder: RunRecorder,
+    parts: MapParts,
+    calibration: SelfCalibration | None = None,
+    misplaced: Sequence[int] = (),
 ) -> LocatedShare:
     """Frames that landmarks gave a pose in the map that is reported, that of the first frame.
 
-    Of all, with those before the first one. None is decided that a loose camera has seen.
+    Of all, with those before the first one. None is decided that a loose camera has seen. None is
+    located whose images are ``misplaced``, of another moment than its number tells, nor in such a
+    drive one that is undecided.
     """
     all_of = recorder.left_out + len(recorder)
     status = recorder.column("status")
     undecided = int((status == EgoMotionStatus.CONTRADICTED.value).sum())
     if calibration is not None and len(calibration.moves) > 1:
         undecided = max(undecided, len(recorder) - calibration.moves[0])
-    return LocatedShare(in_first_map(recorder, parts), all_of, _LEAST_IN_MAP, undecided)
+    there = in_first_map(recorder, parts)
+    if len(misplaced):
+        there &= ~np.isin(recorder.log.numbers, misplaced)
+        there &= status != EgoMotionStatus.CONTRADICTED.value
+    return LocatedShare(int(there.sum()), all_of, _LEAST_IN_MAP, undecided)
 
 
 def alarms(share: LocatedShare | None, landmarks: object) -> tuple[str, ...]:

@@ -482,9 +482,9 @@ def connected_frames(recorder: RunRecorder, parts: MapParts) -> BoolArray:
     return parts.connected[: len(recorder)]
 
 
-def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
-    """How many frames are located in what measurements connect with the first one."""
-    return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
+def in_first_map(recorder: RunRecorder, parts: MapParts) -> BoolArray:
+    """(n,) frames that are located in what measurements connect with the first one."""
+    return located_frames(recorder) & connected_frames(recorder, parts)
 
 
 def session_remarks(
@@ -528,7 +528,7 @@ def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[Remark, ...]:
         out.append(Remark("bridged", tuple(numbers[bridged].tolist())))
     apart = located_frames(recorder) & ~connected_frames(recorder, parts)
     if apart.any():
-        known = in_first_map(recorder, parts)
+        known = int(in_first_map(recorder, parts).sum())
         values = {"known": known, "all": n, "percent": 100.0 * known / n}
         out.append(Remark("unconnected", tuple(numbers[apart].tolist()), values))
     return tuple(out)

@@ -584,14 +584,18 @@ class Witnesses:
             return one.verdict
         return "odometry" if score > 0.0 else "images"
 
+    @property
+    def misplaced(self) -> list[int]:
+        """Numbers of the frames whose images belong to others, or do so in all likelihood."""
+        jumping = {one.episode for one in self.found if one.number in self.disordered}
+        also = (one.number for one in self.found if one.episode in jumping)
+        return sorted({*self.disordered, *also})
+
     def remarks(self) -> tuple[Remark, ...]:
         """The causes, as far as the drive shows them."""
-        by = defaultdict[str, list[Contradiction]](list)
-        for episode in range(len(self.score)):
-            frames = [one for one in self.found if one.episode == episode]
-            moved = any(one.number in self.disordered for one in frames)
-            for one in frames:
-                by["jumps" if moved else self._decided(one)].append(one)
+        by, jumps = defaultdict[str, list[Contradiction]](list), self.misplaced
+        for one in self.found:
+            by["jumps" if one.number in jumps else self._decided(one)].append(one)
         repeats = [one for one in by["odometry"] if one.repeats]
         bodies = [one for one in by["odometry"] if not one.repeats]
         errs, values = _odometry_errs(by["undecided"], self._agreed_m)
@@ -601,7 +605,6 @@ class Witnesses:
             (bodies, _body_moves(bodies)),
             (by["undecided"], ("witnesses_undecided", {"errs": errs, **values})),
         )
-        jumps = sorted({*self.disordered, *(one.number for one in by["jumps"])})
         out = [Remark("images_out_of_order", tuple(jumps))] if jumps else []
         longer, sigma = self._longer
         if abs(longer) > _SIGMAS * math.hypot(_MOUNT, sigma):

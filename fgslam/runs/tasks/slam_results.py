@@ -536,7 +536,8 @@ class RunOutputs:
     @property
     def located(self) -> LocatedShare:
         """Frames located in the map."""
-        return located(self.recorder, self.pipeline.tracker.parts, self.pipeline.calibration)
+        known, misplaced = self.pipeline.calibration, self.pipeline.witnesses.misplaced
+        return located(self.recorder, self.pipeline.tracker.parts, known, misplaced)
 
     @property
     def title(self) -> str:

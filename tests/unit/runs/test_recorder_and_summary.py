@@ -265,6 +265,14 @@ def test_frames_beyond_the_map_that_is_reported_are_no_success(
     assert all("No success: 33 of 51 frames" in one for one in alarms(share, landmarks=900))
 
 
+@pytest.mark.parametrize(("misplaced", "enough"), [(2, True), (17, True), (18, False)])
+def test_frames_of_another_moment_are_not_located(misplaced: int, enough: bool) -> None:
+    recorder = recorder_of(51)
+    numbers = recorder.log.numbers[10 : 10 + misplaced].tolist()
+    share = located(recorder, Apart([True] * 51), None, numbers)
+    assert (share.frames, share.enough) == (51 - misplaced, enough)
+
+
 @pytest.mark.parametrize(("moves", "enough"), [([], True), ([20], True), ([20, 40], False)])
 def test_what_a_loose_camera_has_seen_is_no_success(moves: list[int], enough: bool) -> None:
     share = located(recorder_of(51), Apart([True] * 51), SimpleNamespace(moves=moves))

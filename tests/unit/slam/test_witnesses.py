@@ -112,6 +112,10 @@ def test_images_out_of_order_are_named_and_do_no_harm(order: dict[int, int]) -> 
         (note,) = (one for one in found.notes if not isinstance(one, str))
         assert set(note.frames) <= set(range(min(order), max(order) + 2))
         assert error_m(found) < 0.02
+        parts, known = session.pipeline.tracker.parts, session.pipeline.witnesses.misplaced
+        share = located(session.recorder, parts, None, known)
+        assert set(note.frames) == set(known)
+        assert share.frames <= FRAMES - len(note.frames)
 
 
 def test_images_out_of_order_are_named_without_odometry() -> None:
