@@ -571,7 +571,11 @@ class CameraWatch:
             if repeated or swapped:
                 continue
             if self._before:
-                flow = flow or _followed_of(now.images[0], self._before[0], points, shown)
+                if flow is None:  # of points that no other image shows, nowhere
+                    flow = points.copy(), np.zeros(len(points), np.bool_)
+                    flow[0][shown], flow[1][shown] = followed(
+                        now.images[0], self._before[0], points[shown]
+                    )
                 since = flow[0][kept], flow[1][kept]
                 seen.append(self._judge(camera, now, (here, there), since))
             else:  # as if at rest: how far points moved is not known
@@ -721,13 +725,6 @@ def _named(which: list[bool]) -> str:
 
 def _names(which: Sequence[bool]) -> str:
     return " and ".join(CAMERA_NAMES[k] for k, one in enumerate(which) if one)
-
-
-def _followed_of(a: Image, b: Image, points: FloatArray, which: BoolArray) -> Followed:
-    """As :func:`followed`, of some points (n,); the others come back nowhere."""
-    found, kept = points.copy(), np.zeros(len(points), np.bool_)
-    found[which], kept[which] = followed(a, b, points[which])
-    return found, kept
 
 
 def _grey(image: Image, points: FloatArray) -> FloatArray:

@@ -155,7 +155,7 @@ def located(
     """Frames that landmarks gave a pose in the map that is reported, that of the first frame.
 
     Of all, with those before the first one. None is decided that a loose camera has seen. None is
-    located whose images are ``misplaced``, of another moment than its number tells, nor in such a
+    located whose images are ``misplaced``, of another moment than its number states, nor in such a
     drive one that is undecided.
     """
     all_of = recorder.left_out + len(recorder)

@@ -123,7 +123,9 @@ class SlamPipeline:
             measured: by other sensors.
         """
         self.watch_of_frame = Stopwatch()
-        before = self._before()
+        self.rewound = False
+        parts = self.watch, self.motion, self.key_frames  # what a frame changes before its features
+        before = [(part, snapshot(part)) for part in parts if has_state(part)]
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
         step = self.witnesses.widened(odometry)
@@ -161,12 +163,6 @@ class SlamPipeline:
         return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)
 
     # -- the steps, in their order -------------------------------------------------------------
-
-    def _before(self) -> Snapshot:
-        """What a frame changes before its features are found."""
-        self.rewound = False
-        parts = self.watch, self.motion, self.key_frames
-        return [(part, snapshot(part)) for part in parts if has_state(part)]
 
     @timed("watch")
     def _check_cameras(
