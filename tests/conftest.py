@@ -21,6 +21,12 @@ from fgslam.core.threads import one_blas_thread
 # ones took two fifths of the time of collecting.
 gc.set_threshold(50_000, 20, 100)
 
+
+def pytest_collection_finish() -> None:
+    """What is collected stays: later searches for cycles pass it over."""
+    gc.freeze()
+
+
 # A red test must be red again on the next run, and slow machines must not make one red.
 settings.register_profile(
     "fgslam", max_examples=50, derandomize=True, deadline=None, print_blob=True

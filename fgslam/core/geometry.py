@@ -251,9 +251,10 @@ def body_to_camera_motion(bTb: FloatArray, bTc: FloatArray) -> FloatArray:
 
 
 def reorthonormalise(wTc: FloatArray) -> FloatArray:
-    """The nearest rigid motion (4, 4); removes the drift of many products."""
-    u, _, vt = np.linalg.svd(wTc[:3, :3])
-    return pose(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, wTc[:3, 3])
+    """The nearest rigid motions (..., 4, 4); removes the drift of many products."""
+    u, _, vt = np.linalg.svd(wTc[..., :3, :3])
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return pose(u @ vt, wTc[..., :3, 3])
 
 
 def rotation_angle(rotation: FloatArray) -> float:

@@ -276,9 +276,8 @@ def _read_poses(path: Path, rig: CameraRig, numbers: IntArray) -> Trajectory | N
         off = np.abs(wTl[:3, :3] @ wTl[:3, :3].T - np.eye(3)).max()
         if off > _NOT_RIGID or not np.array_equal(wTl[3], [0.0, 0.0, 0.0, 1.0]):
             raise DatasetError(f"{path}, line {table.lines[k]}: not a rigid pose; correct the line")
-    rigid = np.array([reorthonormalise(wTl) for wTl in left]).reshape(-1, 4, 4)
     stamps = table.values[chosen, 0] * FRAME_PERIOD_S
-    return Trajectory(stamps, right_from_left_camera(rigid, rig.baseline))
+    return Trajectory(stamps, right_from_left_camera(reorthonormalise(left), rig.baseline))
 
 
 def _frames(

@@ -191,9 +191,9 @@ def _alphabet(rng: np.random.Generator) -> Grey:
     for glyph in glyphs:
         for _ in range(int(rng.integers(2, 5))):
             if rng.random() < 0.5:
-                glyph[int(rng.choice([0, 3, 6])), int(rng.integers(0, 3)) : 5] = 1.0
+                glyph[3 * int(rng.integers(0, 3)), int(rng.integers(0, 3)) : 5] = 1.0
             else:
-                glyph[int(rng.integers(0, 4)) : 7, int(rng.choice([0, 2, 4]))] = 1.0
+                glyph[int(rng.integers(0, 4)) : 7, 2 * int(rng.integers(0, 3))] = 1.0
     return glyphs
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -147,6 +148,7 @@ def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> P
     return next(folder.glob(f"{path.name}*"))
 
 
+@cache  # it compiles what it serialises, once
 def _types(ros1: bool) -> Typestore:
     if not ros1:
         return get_typestore(Stores.ROS2_HUMBLE)

@@ -57,7 +57,7 @@ PERIOD_S = 0.5
 @pytest.fixture(scope="module")
 def world() -> Simulation:
     """A drive past known points; landmark ``PRUNED`` is dropped after frame 8 for good."""
-    drive = simulate(Drive(frames=FRAMES, period_s=PERIOD_S), np.random.default_rng(2))
+    drive = simulate(Drive(FRAMES, points=70, period_s=PERIOD_S), np.random.default_rng(2))
     increments = list(drive.increments)
     increments[8] = dataclasses.replace(increments[8], pruned_ids=np.array([PRUNED]))
     increments = keep(increments, lambda k, x: (x.observations.ids != PRUNED) | (k <= 8))

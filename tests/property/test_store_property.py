@@ -115,7 +115,7 @@ def assert_same(a: Any, b: Any) -> None:
 
 
 @given(EVERYTHING)
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_values_come_back_as_they_were_from_a_file(
     tmp_path_factory: Any, value: Everything
 ) -> None:

@@ -147,9 +147,9 @@ class FastSlam:
 
     def _retracted(self, poses: FloatArray, steps: FloatArray) -> FloatArray:
         """Poses (n, 4, 4) moved by steps (n, 6), staying on a hard floor."""
-        pairs = zip(poses, steps, strict=True)
         if self._floor.rigid_dof == 6:
-            return np.array([reorthonormalise(wTc @ se3_exp(step)) for wTc, step in pairs])
+            return reorthonormalise(poses @ np.array([se3_exp(step) for step in steps]))
+        pairs = zip(poses, steps, strict=True)
         return np.array([self._floor.constrain(moved_apart(wTc, step)) for wTc, step in pairs])
 
     def _linearised(

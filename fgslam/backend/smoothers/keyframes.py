@@ -299,9 +299,7 @@ def _locate(
         hessian[~enough] = 0.0
         steps = np.zeros((len(frames), 6))
         steps[enough] = np.linalg.solve(hessian[enough], gradient[enough][:, :, None])[:, :, 0]
-        poses = np.array(
-            [reorthonormalise(T @ se3_exp(step)) for T, step in zip(poses, steps, strict=True)]
-        )
+        poses = reorthonormalise(poses @ np.array([se3_exp(step) for step in steps]))
         if iteration == _LOCATING_ITERATIONS // 2 - 1:
             fits[np.flatnonzero(fits)[squared > _GATE]] = False
     return poses, hessian

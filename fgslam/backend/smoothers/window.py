@@ -998,7 +998,7 @@ class Window:
 
         What is known of ``saved`` landmark variables stays where it is: it is not of this drive.
         """
-        self.poses = np.array([reorthonormalise(by @ pose) for pose in self.poses])
+        self.poses = reorthonormalise(by @ self.poses)
         weak = self.landmarks
         stays = np.isin(weak.variables, saved)[:, None]
         turned = by[:3, :3] @ weak.information @ by[:3, :3].T

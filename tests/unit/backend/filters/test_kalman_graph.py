@@ -40,7 +40,7 @@ EXACT = np.zeros((6, 6))
 EPSILON = float(np.finfo(float).eps)
 UNCERTAIN = np.diag([0.002, 0.003, 0.001, 0.01, 0.02, 0.015]) ** 2
 PLANAR = np.diag([0.0, 0.003, 0.0, 0.01, 0.0, 0.015]) ** 2
-DRIVE = Drive(frames=40, points=150, prune_after=3)
+DRIVE = Drive(frames=16, points=80, prune_after=3)
 
 Pair = tuple[LandmarkKalman, LandmarkKalmanGraph]
 
