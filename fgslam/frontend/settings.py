@@ -328,7 +328,8 @@ class HomingVectorSettings:
     )
     second_look: bool = Field(
         default=True,
-        description="match unclear images again with all candidates, at a third of a second",
+        description="match again with all candidates, at a third of a second: answers unclear "
+        "images, confirms clear ones",
     )
     direction_floor_deg: NonNegative = Field(
         default=0.0,

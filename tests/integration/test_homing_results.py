@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import equal_corridors
 import mirror_door
 import numpy as np
@@ -44,13 +45,35 @@ def test_pairs_of_real_panoramas(shared_data: Path, tmp_path: Path) -> None:
     errors = values["errors"]
     assert values["pairs"] == 120
     assert values["answered"] >= 1.5 * values["reference"]["answered"]
-    assert values["answered"] >= 36
+    # 35, one of which rounding may turn: what an eighth of a view decides is refused (36 before).
+    assert values["answered"] >= 34
     assert errors["direction_median_deg"] <= 1.1
     assert errors["rotation_median_deg"] <= 0.45
     assert errors["direction_worst_deg"] <= 6.0
     assert errors["worse_than_10_deg"] == 0
     assert errors["covered_direction_2_sigma"] >= 0.9
     assert errors["covered_rotation_2_sigma"] >= 0.9
+
+
+@pytest.mark.data
+def test_no_pair_of_real_panoramas_of_half_the_size_is_wrong(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """Fewer features: a second look that asked the score alone was wrong three times in 59."""
+    folder = shared_data / "omni_home"
+    if not folder.is_dir():
+        pytest.skip(f"no recording {folder}: this test needs it")
+    (tmp_path / "half" / "panos").mkdir(parents=True)
+    for one in (folder / "panos").glob("*.jpg"):
+        half = cv2.resize(cv2.imread(str(one)), (1024, 512), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / "half" / "panos" / f"{one.stem}.png"), half)
+    places = (folder / "poses.csv").read_text(encoding="utf-8").replace(".jpg", ".png")
+    (tmp_path / "half" / "poses.csv").write_text(places, encoding="utf-8")
+    where = f"dataset.path={tmp_path / 'half'}"
+    values = metrics_of("homing_panoramas", tmp_path / "run", where)
+    assert values["answered"] >= 22
+    assert values["errors"]["worse_than_10_deg"] == 0
+    assert values["errors"]["covered_direction_2_sigma"] >= 0.9
 
 
 def test_a_path_in_the_rendered_house(tmp_path: Path) -> None:
@@ -82,8 +105,8 @@ def test_near_a_mirror_door_no_vector_is_surely_that_of_the_reflection() -> None
     A degree is what objects that occur twice, one of them behind the glass, may pull a direction.
     """
     extractor = OmniFeatureExtractor(mirror_door.CAMERA, DRIVING.features)
-    places = [(0.9, 3.1), (0.9, 4.2), (1.5, 3.6), (2.1, 2.8)]
-    poses = np.array([(x, y, 0.5 * k) for k, (x, y) in enumerate(places)])
+    places = [(0.9, 3.1, 0.0), (0.9, 4.2, 0.5), (1.5, 3.6, 1.0), (2.1, 2.8, 1.5)]
+    poses = np.array([*places, (3.47, 2.05, 2.74), (1.25, 5.85, 3.01)])  # far apart, half a turn
     seen = [extractor.extract(mirror_door.picture(pose, k)) for k, pose in enumerate(poses)]
     settings, answered = DRIVING.homing_vector, 0
     for a, b in itertools.permutations(range(len(poses)), 2):
@@ -95,7 +118,7 @@ def test_near_a_mirror_door_no_vector_is_surely_that_of_the_reflection() -> None
             sigma = np.sqrt(np.diag(vector.covariance))
             assert (np.abs(off) <= np.maximum(3.0 * sigma, np.deg2rad(1.0))).all()
             answered += 1
-    assert answered >= 6
+    assert answered >= 20
 
 
 def test_between_equal_sections_of_a_corridor_no_place_is_wrong_and_no_vector_too_sure() -> None:

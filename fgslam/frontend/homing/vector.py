@@ -709,11 +709,12 @@ def _blocks(bearing: FloatArray, elevation: FloatArray, degrees: float) -> IntAr
 # The homing vector from the features of two images, near or far apart
 #
 # The matches decide where many of them agree. Where they do not, or barely, their best hypotheses
-# are looked at again with all candidate matches (:mod:`.candidates`): refined on them, scored by
-# them, and answered if the score is beyond what views reach that share nothing.
+# are looked at again with all candidate matches: refined on them, scored by them, and answered if
+# the score is beyond what views reach that share nothing, and that of no other motion is. A clear
+# answer stands unless they speak for another one.
 
 
-_CLEAR_SUPPORT = 50  # independent inliers of an answer that needs no second look
+_CLEAR_SUPPORT = 50  # independent inliers of an answer that is only confirmed
 _CLEAR_SIGMA = np.deg2rad(0.5)  # of its direction: beyond, the matches leave a valley
 _HYPOTHESES = 80  # that are scored again
 _PAIR_REFINED = 24  # of them are refined
@@ -734,6 +735,7 @@ def vector_between(
     matching: OmniMatchingSettings,
     settings: HomingVectorSettings,
     rng: np.random.Generator,
+    alone: bool = True,
 ) -> tuple[TwoViewVector | Refusal, BearingMatches]:
     """The homing vector from one image's place to another's, and the tentative matches.
 
@@ -743,18 +745,23 @@ def vector_between(
         matching: of features.
         settings: of the search, and when it refuses.
         rng: chooses RANSAC's samples.
+        alone: nothing else is known of these images; else those before show which motion is right.
     """
     distances = planar_distances(present.sift, target.sift, matching)
     matches = match_features(present, target, matching, distances)
     search = HomingSearch(matches, settings, rng)
     answer = search.answer()
-    if not settings.second_look or _is_final(answer, search):
+    final = _is_final(answer, search)
+    if not settings.second_look or (final and not (answer and alone)):
         return answer, matches
     candidates = candidate_matches(present.sift, target.sift, distances)
     hypotheses = search.different(_HYPOTHESES)
     if len(candidates) < settings.min_inliers or not len(hypotheses):
         return answer, matches
-    return SecondLook(candidates, settings).answer(hypotheses), candidates.matches
+    look = SecondLook(candidates, settings)
+    if final and isinstance(answer, TwoViewVector):
+        return look.confirmed(answer, hypotheses), matches
+    return look.answer(hypotheses, alone), candidates.matches
 
 
 def pair_generator(seed: int, a: int, b: int) -> np.random.Generator:
@@ -784,7 +791,7 @@ class SecondLook:
     def __init__(self, candidates: Candidates, settings: HomingVectorSettings) -> None:
         """Prepares test, refinement and score."""
         self._settings = settings
-        self._count = len(candidates)
+        self._candidates = candidates
         tilt = np.deg2rad(settings.tilt_sigma_deg)
         self._test = EpipolarTest.of(candidates.matches, tilt)
         self._score = GuidedScore(candidates)
@@ -796,22 +803,36 @@ class SecondLook:
             candidates.right,
         )
 
-    def answer(self, hypotheses: FloatArray) -> TwoViewVector | Refusal:
-        """The best of hypotheses (c, 2), direction and rotation, or why none is the answer."""
+    def answer(self, hypotheses: FloatArray, alone: bool = True) -> TwoViewVector | Refusal:
+        """The best of hypotheses (c, 2), direction and rotation, or why none is the answer.
+
+        ``alone``: nothing else is known of these two images, see :meth:`_alone`.
+        """
         best, *others = self._solutions(hypotheses)
         rivals = [other for other in others if self._differ(best, other)]
         covariance = self._covariance(best, others)
         refusal = self._refusal(best, rivals[0].score if rivals else 0.0, covariance)
+        if refusal is None and alone:
+            refusal = self._alone(best, hypotheses)
         if refusal is not None:
             return refusal
         theta, psi = (float(v) for v in best.refined.parameters[:2])
         floor = np.deg2rad([self._settings.direction_floor_deg, self._settings.rotation_floor_deg])
-        inliers = np.zeros(self._count, np.bool_)
+        inliers = np.zeros(len(self._candidates), np.bool_)
         inliers[best.rows] = True
         support = len(rivals[0].rows) if rivals else 0
         # As of a first look: neither level nor clearly tilted.
         wrong = 0.5 if self._refinement.strain(best.refined) > _LEVEL else 0.0
         return TwoViewVector(theta, psi, covariance + np.diag(floor**2), inliers, support, wrong)
+
+    def confirmed(self, first: TwoViewVector, hypotheses: FloatArray) -> TwoViewVector | Refusal:
+        """The answer of a first look, unless the candidates speak more for a different one."""
+        here = self._solutions(np.array([[first.direction, first.rotation]]))[0]
+        best = self._solutions(hypotheses)[0]
+        if best.score <= here.score or not self._differ(best, here):
+            return first
+        text = f"evidence of {here.score:.0f}, {best.score:.0f} for a different solution"
+        return Refusal(RefusalReason.AMBIGUOUS, text)
 
     def _solutions(self, hypotheses: FloatArray) -> list[_Solution]:
         """The most promising ones, refined, the best first."""
@@ -837,6 +858,27 @@ class SecondLook:
         residuals = np.where(refined.inliers, refined.residuals, np.nan)
         theta, psi = refined.parameters[:2]
         return self._score.of(theta, psi, residuals, INLIER_SIGMAS)
+
+    def _alone(self, best: _Solution, hypotheses: FloatArray) -> Refusal | None:
+        """Why the best solution is no answer to two images of which nothing else is known.
+
+        Its tilts and height cost evidence as of their prior. And what it leaves must not be enough
+        for an answer of its own: a mirror, and rooms alike, show several motions in earnest.
+        """
+        evidence = best.score - 0.5 * self._refinement.strain(best.refined)
+        if evidence < _LEAST_SCORE:
+            text = f"evidence of {evidence:.0f} after its tilts, of {_LEAST_SCORE:.0f} needed"
+            return Refusal(RefusalReason.TOO_FEW_INLIERS, text)
+        m = self._candidates.matches
+        left = ~np.isin(m.index_a, m.index_a[best.rows]) & ~np.isin(m.index_b, m.index_b[best.rows])
+        if np.count_nonzero(left) < self._settings.min_inliers:
+            return None
+        rest = SecondLook(self._candidates.select(left), self._settings)._solutions(hypotheses)
+        second = max((other.score for other in rest if self._differ(best, other)), default=0.0)
+        if second < _LEAST_SCORE:
+            return None
+        text = f"evidence of {best.score:.0f}, of the rest {second:.0f} for a different motion"
+        return Refusal(RefusalReason.AMBIGUOUS, text)
 
     def _differ(self, one: _Solution, other: _Solution) -> bool:
         apart = np.abs(wrap(one.refined.parameters[:2] - other.refined.parameters[:2]))

@@ -36,6 +36,7 @@ from fgslam.frontend.homing.vector import (
     Candidates,
     GuidedScore,
     HomingSearch,
+    SecondLook,
     candidate_matches,
     edge_likeness,
     estimate_homing_vector,
@@ -456,6 +457,56 @@ def test_inliers_are_features_that_occur_once() -> None:
     assert isinstance(found, TwoViewVector)
     kept = matches.select(found.inliers)
     assert len(np.unique(kept.index_a)) == len(np.unique(kept.index_b)) == len(kept)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_second_motion_with_evidence_enough_for_an_answer_is_a_refusal(seed: int) -> None:
+    """Sixty things, and 45 others as seen from a camera that is turned by a radian more.
+
+    Where the images before tell which of both is the camera's, the better one is the answer.
+    """
+    (a, b), (c, d) = crowded_views(seed, 60, 20.0), crowded_views(seed + 100, 45, 20.0)
+    turned = replace(d.sift, bearing=wrap(d.sift.bearing + 1.0))
+    views = (
+        OmniFeatures(a.sift.join(c.sift), empty_segments()),
+        replace(b, sift=b.sift.join(turned)),
+    )
+    alone, among = (
+        vector_between(*views, MATCHING, PAIR_SETTINGS, pair_generator(0, 0, 1), one)[0]
+        for one in (True, False)
+    )
+    assert isinstance(alone, Refusal)
+    assert alone.reason is RefusalReason.AMBIGUOUS
+    assert "for a different motion" in alone.details
+    assert isinstance(among, TwoViewVector)
+    assert off_deg(among) < 1.0
+
+
+def test_tilts_that_are_unlikely_cost_evidence() -> None:
+    """The second camera is tilted by six of the prior's sigmas."""
+    a, b = crowded_views(3, 45, 28.0)
+    tilted = b.sift.elevation + np.deg2rad(3.0) * np.cos(b.sift.bearing)
+    b = replace(b, sift=replace(b.sift, elevation=tilted))
+    alone, among = (
+        vector_between(a, b, MATCHING, PAIR_SETTINGS, pair_generator(0, 0, 1), one)[0]
+        for one in (True, False)
+    )
+    assert isinstance(among, TwoViewVector)
+    assert isinstance(alone, Refusal)
+    assert "after its tilts" in alone.details
+
+
+def test_a_clear_answer_stands_unless_the_candidates_speak_for_another_one() -> None:
+    a, b = crowded_views(1, 45, 20.0)
+    look = SecondLook(candidates_of(a.sift, b.sift), PAIR_SETTINGS)
+    theta, psi = TRUE
+    right = TwoViewVector(theta, psi, np.eye(2) * 1e-4, np.zeros(0, np.bool_), 0)
+    wrong = replace(right, direction=theta + 1.0)
+    hypotheses = np.array([TRUE, [theta + 1.0, psi]])
+    assert look.confirmed(right, hypotheses) is right
+    refusal = look.confirmed(wrong, hypotheses)
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason is RefusalReason.AMBIGUOUS
 
 
 # --------------------------------------------------------------------------------------------
