@@ -373,7 +373,7 @@ class _Fit:
             raise CalibrationError(_UNDETERMINED)
         information /= np.outer(scale, scale)
         left = len(off) - len(x)
-        if left <= 0 or not np.linalg.cond(information) <= 1e14:
+        if left <= 0 or not converged or not np.linalg.cond(information) <= 1e14:
             raise CalibrationError(_UNDETERMINED)
         covariance = off @ off / left * np.linalg.inv(information) / np.outer(scale, scale)
         values, own = self.parts(x), self.values.intrinsics.shape[1]
@@ -389,11 +389,6 @@ class _Fit:
                 raise CalibrationError(_UNDETERMINED) from None
             if not by @ covariance[at, at] @ by <= _UNCERTAIN**2:
                 raise CalibrationError(_UNDETERMINED)
-        if not converged:
-            raise CalibrationError(
-                f"the fit of the {self.model} cameras does not converge in {MOST_STEPS} steps; try "
-                "another --lens, or leave out images in which corners were found wrongly"
-            )
         return values, self.parts(np.sqrt(np.diag(covariance)))
 
 
@@ -611,10 +606,11 @@ def judged(
         squares.append(np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1))
     if not count:
         return None
-    spread = np.median(np.abs(np.concatenate(rows)))
+    # A corner at which no ray of the camera ends is off by more than any.
+    spread = np.median(np.nan_to_num(np.abs(np.concatenate(rows)), nan=np.inf))
     rows_px = _MEDIAN_TO_SIGMA * float(spread) * first.focal_px
     reach = DEPTH_SHARE * baseline * first.focal_px / max(rows_px, 1e-9)
-    return HeldOut(count, rows_px, float(np.median(np.concatenate(squares))), reach)
+    return HeldOut(count, rows_px, float(np.nanmedian(np.concatenate(squares))), reach)
 
 
 def _triangulated(

@@ -79,13 +79,7 @@ def judged_turns(recording: Recording) -> Judged:
         if turn is not None:
             rows.append(i)
             turns.append(rig.bTc[:3, :3] @ turn)
-    if len(rows) < _FEWEST_STEPS:
-        return Judged()
-    first = next((step for step in steps if step is not None), None)
-    by_gyroscope = first is not None and first.turned
-    return judged(
-        SeenTurns(recording.name, np.array(rows), np.array(turns), stamps, source, by_gyroscope)
-    )
+    return judged(SeenTurns.of(recording, np.array(rows), np.array(turns)))
 
 
 def _turns(steps: Sequence[Odometry | None]) -> FloatArray:
@@ -104,6 +98,16 @@ class SeenTurns:
     stamps: FloatArray
     source: OdometrySource
     by_gyroscope: bool
+
+    @classmethod
+    def of(cls, recording: Recording, rows: IntArray, turns: FloatArray) -> SeenTurns:
+        """Turns in those steps of a recording that has odometry."""
+        source, steps = recording.odometry_source, map(recording.odometry, range(1, len(recording)))
+        assert source is not None  # noqa: S101 - for the type checker
+        first = next((step for step in steps if step is not None), None)
+        stamps = recording.timestamps
+        turned = first is not None and first.turned
+        return cls(recording.name, rows, turns, stamps, source, turned)
 
     def by_odometry(self, shift: float) -> FloatArray:
         """(k, 3) with its stamps later by ``shift`` seconds; NaN where not covered."""
@@ -135,13 +139,17 @@ def _median(errors: FloatArray) -> float:
 
 def judged(seen: SeenTurns) -> Judged:
     """The same of turns that were seen already; raises as :func:`judged_turns`."""
+    if len(seen.rows) < _FEWEST_STEPS:
+        return Judged()
     size = float(np.median(np.linalg.norm(seen.turns, axis=1)))
     best = 0.0  # seconds to be added to the stamps, on a coarse grid, then on a fine one
     for reach, step in ((_RANGE_S, _COARSE_S), (_COARSE_S, _FINE_S)):
-        count = round(reach / step)
-        shifts = best + step * np.arange(-count, count + 1)
-        nearest = shifts[np.argsort(np.abs(shifts), kind="stable")]  # of equals the least
-        best = float(nearest[int(np.argmin([_median(seen.errors(s)) for s in nearest]))])
+        count, middle = round(reach / step), np.inf
+        while abs(best - middle) > reach - step:  # the best is at the grid's edge: go on there
+            middle = best
+            shifts = middle + step * np.arange(-count, count + 1)
+            nearest = shifts[np.argsort(np.abs(shifts), kind="stable")]  # of equals the least
+            best = float(nearest[int(np.argmin([_median(seen.errors(s)) for s in nearest]))])
     now, then = seen.errors(0.0), seen.errors(best)
     before, left = _median(now), _median(then)
     if size > _LEAST_TURN_RAD:
@@ -154,7 +162,7 @@ def judged(seen: SeenTurns) -> Judged:
         scale = float(np.median(odometry[known] / images[known])) if known.any() else 1.0
         if _DEGREES / _LIKE_DEGREES < scale < _DEGREES * _LIKE_DEGREES:
             raise OdometryError(
-                f"the odometry of {seen.name} turns {scale:.0f} times as fast as the images: its "
+                f"the odometry of {seen.name} turns {scale:.0f} times as fast as the camera: its "
                 "angular velocity is in degrees/s, not radians/s; name the columns so (gyro_x_dps)"
             )
     if size > _CLEAR_TURN_RAD and left > _AGREES * size and seen.by_gyroscope:

@@ -42,7 +42,7 @@ from fgslam.datasets.settings import (
     LooseImagesSettings,
     RecordedOdometrySettings,
 )
-from fgslam.datasets.times import pair_files, read_table, require_increasing, stamps_of
+from fgslam.datasets.times import named_unit, pair_files, read_table, require_increasing, stamps_of
 
 # ------------------------------------------------------------------------------------------
 # Our own layout: left/, right/[, top/], calib.json, times.txt
@@ -79,7 +79,7 @@ def open_image_folder(
             "calibration of all three, or move top/ elsewhere"
         )
     rig = mounted(rig if three else replace(rig, vertical_baseline=None), settings)
-    numbers, stamps = _read_times(root / "times.txt")
+    numbers, stamps, timed = _read_times(root / "times.txt")
     files, listed, ledger = numbered_frames(cameras, numbers.tolist(), root / "times.txt")
     images, noticed = open_frames(files, rig, root)
     stated = set(numbers.tolist())
@@ -93,7 +93,7 @@ def open_image_folder(
         )
     present = [path for path in (calibration,) if path.is_file()]
     defined = [*present, root / "times.txt"], listed
-    all_notes = (*noticed, *notes)
+    all_notes = (*timed, *noticed, *notes)
     return folder_recording(
         settings, odometry, root, rig, stamps, images, defined, all_notes, ledger=ledger
     )
@@ -148,8 +148,8 @@ def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:
     return cameras
 
 
-def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
-    """Image numbers (n,) and stamps (n,) in seconds."""
+def _read_times(path: Path) -> tuple[IntArray, FloatArray, tuple[str, ...]]:
+    """Image numbers (n,), stamps (n,) in seconds, and a note where the file has another unit."""
     table = read_table(path, ("image number", "time"))
     stated = table.values[:, 0]
     wrong = np.flatnonzero((stated != np.floor(stated)) | (stated < 0) | (stated > _LAST_NUMBER))
@@ -168,7 +168,8 @@ def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
             f"{path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; remove one"
         )
     require_increasing(table, table.values[:, 1])
-    return numbers, table.values[:, 1]
+    unit, note = named_unit(table.values[:, 1], str(path))
+    return numbers, unit * table.values[:, 1], note
 
 
 # ------------------------------------------------------------------------------------------

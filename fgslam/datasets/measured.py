@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
-from importlib.util import find_spec
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -167,12 +167,8 @@ def open_stereo_tracks(
     """
     path = Path(settings.file)
     if settings.file in _INSIDE:
-        found = find_spec("gtsam")
-        if found is None or found.origin is None:
-            raise DatasetError(
-                "the stereo tracks lie inside gtsam; install it, or give dataset.file a path"
-            )
-        path = Path(found.origin).parent / "Data" / f"{_PREFIX}{_INSIDE[settings.file]}.txt"
+        name = f"gtsam/Data/{_PREFIX}{_INSIDE[settings.file]}.txt"
+        path = Path(str(distribution("gtsam").locate_file(name)))
     if not path.is_file():
         raise DatasetError(
             f"{path}: no such file; dataset.file is {', '.join(_INSIDE)} or a file {_PREFIX}*.txt"

@@ -109,14 +109,12 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
     """Open a video file; times come from its rate or its frames, the first of which is at 0 s.
 
     Raises:
-        DatasetError: the file is absent, no video, or without a frame rate.
+        DatasetError: the file is absent or no video.
         CalibrationError: the camera is impossible, or calibrated for another size.
         FrameError: the first frame cannot be decoded.
     """
     path = Path(settings.path)
     frames = VideoFrames(path)
-    if not 0.0 < frames.rate < np.inf:
-        raise DatasetError(f"{path} states no frame rate; convert it to a file that does")
     chosen = select_frames(frames.count, settings, settings.path)
     first = frames.load(int(chosen[0]))
     numbers, times, timed, _ = moments_of([frames], frames.rate, stated=False)

@@ -49,6 +49,7 @@ from fgslam.datasets.times import (
     NANOSECONDS,
     Table,
     listed_files,
+    named_unit,
     pair_files,
     pair_stamps,
     poses_of,
@@ -190,8 +191,9 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     sides = (folder / f"image_{pair[1]}", folder / f"image_{pair[0]}")
     cameras = {side: list_numbered_images(side) for side in sides}
     table = read_table(times, ("time",))
-    stamps = table.values[:, 0]
-    require_increasing(table, stamps)
+    require_increasing(table, table.values[:, 0])
+    unit, timed = named_unit(table.values[:, 0], str(times))
+    stamps = unit * table.values[:, 0]
     paths, listed, ledger = numbered_frames(cameras, range(len(stamps)), times)
     size = first_size(frame[0] for frame in paths)  # which calib.txt does not state
     if size is None:
@@ -200,6 +202,7 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
         )
     rig = load_rig(calibration, size=size)
     images, noticed = open_frames(paths, rig, folder)
+    noticed = (*timed, *noticed)
     name, files = f"KITTI {settings.sequence}", ([calibration, times], listed)
     recording = image_recording(settings, name, rig, stamps, images, files, noticed, ledger)
     poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))

@@ -305,7 +305,8 @@ def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
         digest.update(f"{path.name}\0".encode())
         digest.update(path.read_bytes())
     for path in sorted(listed):
-        digest.update(f"{path.parent.name}/{path.name}\0{path.stat().st_size}\0".encode())
+        size = path.stat().st_size if path.exists() else 0  # a link to nothing is a damaged image
+        digest.update(f"{path.parent.name}/{path.name}\0{size}\0".encode())
     return digest.hexdigest()
 
 

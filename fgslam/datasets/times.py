@@ -144,6 +144,9 @@ def read_tum(path: Path) -> Trajectory:
     return Trajectory(table.values[:, 0], poses)
 
 
+_FARTHEST_M = 1e8  # eight times the width of the Earth: beyond the coordinates of any map
+
+
 def poses_of(
     table: Table,
     positions: FloatArray,
@@ -151,7 +154,14 @@ def poses_of(
     error: type[DatasetError] = DatasetError,
 ) -> FloatArray:
     """Poses (n, 4, 4) of positions (n, 3) and unit quaternions (n, 4) (x, y, z, w) of a table."""
-    norms = np.linalg.norm(quaternions, axis=1)
+    norms, farthest = np.linalg.norm(quaternions, axis=1), np.abs(positions).max(axis=1)
+    absurd = np.flatnonzero(farthest > _FARTHEST_M)
+    if len(absurd):
+        k = int(absurd[0])
+        raise error(
+            f"{table.path}, line {table.lines[k]}: a position of {farthest[k]:.3g} m is none on "
+            "Earth; give metres"
+        )
     bad = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE)
     if len(bad):
         k = int(bad[0])
@@ -437,9 +447,14 @@ def in_seconds(
         raise DatasetError(
             f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; {mend}"
         )
-    name, unit = time_unit(values)
-    note = () if name == "seconds" else (f"times of {where} are taken as {name}",)
+    unit, note = named_unit(values, where)
     return unit * (first + values), note
+
+
+def named_unit(times: FloatArray, where: str) -> tuple[float, tuple[str, ...]]:
+    """The unit of a camera's times (n,) in seconds, by their rate; a note where it is another."""
+    name, unit = time_unit(times)
+    return unit, () if name == "seconds" else (f"times of {where} are taken as {name}",)
 
 
 # Lists

@@ -60,8 +60,6 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
         )
     films = [VideoFrames(path) for path in paths]
     rate = settings.fps or films[0].rate
-    if not 0.0 < rate < np.inf:
-        raise DatasetError(f"{paths[0]} states no frame rate; say it: --fps RATE")
     views, rig, assumed = _views(settings, films, paths[0].parent)
     shown, times, timed, pairing = moments_of(films, rate, settings.fps is not None)
     size = rig.image_size
@@ -346,9 +344,9 @@ class VideoFrames:
             return None
         return np.asarray(times - times[0])
 
-    def even(self) -> FloatArray | None:
-        """Seconds (count,) from the first frame on by the stated rate; None without a rate."""
-        return np.arange(self.count) / self.rate if 0.0 < self.rate < np.inf else None
+    def even(self) -> FloatArray:
+        """Seconds (count,) from the first frame on by the stated rate, which OpenCV has of any."""
+        return np.arange(self.count) / self.rate
 
     def _go_to(self, index: int) -> None:
         if index < self._next:

@@ -359,7 +359,8 @@ class RouteMap(TopologicalMap):
         camera = camera or self.camera
         if camera is None:
             raise CalibrationError(
-                "map: its routes were taught with several cameras; give the image's, --camera FILE"
+                "map: its routes were taught with several cameras; give the image's: "
+                "camera=fgslam.load_camera(FILE)"
             )
         picture = colour_image(image, (camera.width, camera.height))
         features = OmniFeatureExtractor(camera, FEATURES).extract(picture)

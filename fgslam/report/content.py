@@ -473,7 +473,8 @@ _ERRS = {
     "odometry_scaled": "its ways are {ratio:.2f} +- {scatter:.2f} of those that images show "
     "(wheel radius, unit; or the rig's baseline is not as stated)",
     "odometry_slips": "images show other ways, by no factor that stays (the wheels slip, its "
-    "clock, or where the camera sits: dataset.camera_yaw_deg, dataset.lever_arm_m)",
+    "clock (odometry.time_offset_s), or where the camera sits: dataset.camera_yaw_deg, "
+    "dataset.lever_arm_m)",
     "odometry_stuck": "it states no motion while images show one",
     "odometry_turned": "its ways are {degrees:.0f} degrees off the direction in which images "
     "show them (the axes of its frame, or dataset.camera_yaw_deg)",

@@ -185,13 +185,11 @@ def read_ply(path: Path) -> MapPoints:
     found = [line for line in lines if line.startswith(("format", "property"))]
     expected = [_PLY_FORMAT, *_ply_properties(dtype)]
     counts = [line for line in lines if re.fullmatch(r"element vertex \d+", line)]
-    if lines[:1] != ["ply"] or not end or found != expected or len(counts) != 1:
-        raise DatasetError(f"{path} is no landmark map; give the map.ply of a run folder")
-    count = int(counts[0].split()[2])
-    if len(body) < count * dtype.itemsize:
+    is_map = lines[:1] == ["ply"] and bool(end) and found == expected and len(counts) == 1
+    count = int(counts[0].split()[2]) if is_map else 0
+    if not is_map or len(body) < count * dtype.itemsize:
         raise DatasetError(
-            f"{path} is cut off: {len(body)} bytes of landmarks instead of "
-            f"{count * dtype.itemsize}; run the experiment again"
+            f"{path} is no landmark map, or cut off; run the experiment again with --overwrite"
         )
     records = np.frombuffer(body, dtype, count)
 

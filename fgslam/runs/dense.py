@@ -204,11 +204,9 @@ def fuse(
     surface = fusion.surface(kept)
     if not len(surface.positions):
         raise DatasetError(
-            f"nothing was seen as well as {100.0 * kept:.3g} cm within {most:.3g} m; use "
-            + (f"larger voxels (--voxel {3.0 * voxel:.2g})" if settings.sigma_m is None
-               else f"a larger --sigma ({KEPT_SIGMA_VOXELS * voxel:.2g})")
-            + " or a larger --range"
-        )  # fmt: skip
+            f"nothing was seen as well as {100.0 * kept:.3g} cm within {most:.3g} m; use a larger "
+            f"--sigma ({max(3.0 * kept, KEPT_SIGMA_VOXELS * voxel):.2g}) or a larger --range"
+        )
     up = (estimate.trajectory.poses[:, :3, :3] @ vertical_of(rig.bTc)).mean(axis=0)
     length = float(np.linalg.norm(up))
     up = up / length

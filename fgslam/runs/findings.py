@@ -97,8 +97,7 @@ FINDINGS: dict[str, tuple[Level, str, str]] = {
     "odometry_noise": (WARNING, AGAINST_TRUTH, "the error in {name} is {ratio:.1f} times the "
      "stated noise; raise its sigma in the odometry settings, or check mounting and time offset"),
     "odometry_clock": (WARNING, AGAINST_TRUTH, "turns agree best when the odometry's stamps are "
-     "shifted by {shift:+.2f} s ({best:.2g} instead of {now:.2g} degrees a step, median); add that "
-     "to odometry.time_offset_s"),
+     "shifted by {shift:+.3f} s; add that to odometry.time_offset_s"),
     "few_features": (WARNING, "features", "the {camera} images have only {count:.0f} SIFT features "
      "(median); lower frontend.sift.contrast_threshold, or give more light or texture"),
     "unequal_features": (WARNING, "features", "the {rich} images have {more:.0f} features but the "

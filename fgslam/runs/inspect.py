@@ -14,11 +14,12 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fgslam.core.arrays import FloatArray, Image, thinned
-from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.errors import DatasetError, FrameError, OdometryError
 from fgslam.core.geometry import inverse, se3_log, so3_log
 from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.types import Trajectory
+from fgslam.datasets.clock import SeenTurns, judged
 from fgslam.datasets.layouts import kitti_drives
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
@@ -322,50 +323,22 @@ def _true_motions(sequence: ImageSequence) -> FloatArray:
     return out
 
 
-_CLOCK_RANGE_S, _CLOCK_STEP_S = 0.2, 0.02
-_FEWEST_STEPS = 20
-_CLEAR_GAIN = 0.7
-_SIGNIFICANT_RAD = np.radians(0.005)
-_YAW = 2  # the body's z axis points up
-
-
 def check_clock(sequence: ImageSequence) -> tuple[Finding, ...]:
-    """Shift of the odometry's clock at which its turns agree best with the truth's.
-
-    Reported where the median yaw error of a step falls by 30 % or more. A recording that never
-    turns gives no finding: its clock cannot be checked.
-    """
+    """Odometry's clock and unit by the truth's turns, judged as by those that images show."""
     if not isinstance(sequence, Recording) or sequence.odometry_source is None:
         return ()
-    if sequence.ground_truth is None or len(sequence.ground_truth) < _FEWEST_STEPS:
-        return ()
-    source, stamps = sequence.odometry_source, sequence.timestamps
     true = _true_motions(sequence)[:, :3, :3]
-
-    def median_error(shift: float) -> float:
-        """Median yaw error of the steps in radians; NaN where too few can be compared."""
-        try:
-            steps = source(stamps - shift)
-        except DatasetError:
-            return float("nan")
-        errors = [
-            abs(so3_log(step.motion[:3, :3].T @ turn)[_YAW])
-            for step, turn in zip(steps, true, strict=True)
-            if step is not None and np.isfinite(turn[0, 0])
-        ]
-        return float(np.median(errors)) if len(errors) >= _FEWEST_STEPS else float("nan")
-
-    reach = round(_CLOCK_RANGE_S / _CLOCK_STEP_S)
-    shifts = _CLOCK_STEP_S * np.arange(-reach, reach + 1)
-    errors = np.array([median_error(shift) for shift in shifts])
-    now = errors[reach]
-    if not np.isfinite(now):
-        return ()
-    best = int(np.nanargmin(errors))
-    if errors[best] > _CLEAR_GAIN * now or now - errors[best] < _SIGNIFICANT_RAD:
-        return ()
-    degrees = {"best": np.degrees(errors[best]), "now": np.degrees(now)}
-    return (finding("odometry_clock", shift=shifts[best], **degrees),)
+    known = np.flatnonzero(np.isfinite(true[:, 0, 0]))
+    turns = np.array([so3_log(turn) for turn in true[known]]).reshape(-1, 3)
+    try:
+        seen = SeenTurns.of(sequence, known + 1, turns)
+    except DatasetError:
+        return ()  # check_odometry has reported it.
+    try:
+        shift = judged(seen).time_offset_s
+    except OdometryError as error:
+        return (finding("odometry_malformed", text=str(error)),)
+    return (finding("odometry_clock", shift=shift),) if shift else ()
 
 
 # --------------------------------------------------------------------------------------------

@@ -326,9 +326,7 @@ def _halves(name: str, run: tuple[Path, str] | None) -> tuple[Estimate, Trajecto
     for half in (0, 1):
         found = replay(part_of(log, half), settings, config.frontend.ego_motion, arrival=arrival)
         if found.failure:
-            raise DatasetError(
-                f"{name}: half of its landmarks do not do: {found.failure}; give --truth FILE"
-            )
+            raise DatasetError(f"{name}: half of its landmarks do not do: {found.failure}")
         halves.append(found.estimate)
     first, second = halves
     both = first.covariances + change_tangent_frame(

@@ -161,9 +161,7 @@ class Pool(Executor):
                 if units.workers or self._cluster is None:
                     seen = time.monotonic()
                 elif time.monotonic() - seen > _START_S:
-                    raise OutputError(
-                        "workers cannot be started; try --jobs 1, or free some memory"
-                    )
+                    raise OutputError("no worker can be started; free some memory")
         finally:
             units.cancel()
         for index in units.left:

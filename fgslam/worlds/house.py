@@ -14,7 +14,6 @@ import numpy as np
 
 from fgslam.cameras.omni import Equirectangular, HyperbolicMirror, OmniCamera
 from fgslam.core.arrays import BoolArray, Float32, FloatArray, Image
-from fgslam.core.errors import CalibrationError
 from fgslam.worlds.driving import RADIUS_M, RangeSensor, Wheelchair
 from fgslam.worlds.floor import FloorSpace, PathPlanner
 from fgslam.worlds.patches import RayCaster, stack
@@ -109,17 +108,10 @@ def miscalibrated(
     """The camera as the robot knows it: itself where there are no errors.
 
     The ring that shows the surroundings keeps its radii: the wrong centre moves it.
-
-    Raises:
-        CalibrationError: the camera is no mirror.
     """
     if errors == HouseCalibrationSettings():
         return camera
-    if not isinstance(camera, HyperbolicMirror):
-        raise CalibrationError(
-            "dataset.calibration: errors of a mirror, but dataset.camera.model is equirectangular; "
-            "take mirror, or leave them out"
-        )
+    assert isinstance(camera, HyperbolicMirror)  # noqa: S101 - as the settings have checked
     signs, side = rng.choice([-1.0, 1.0], 2), rng.uniform(0.0, 2.0 * np.pi)
     xi, focal = (1.0 + errors.mirror * signs) * (camera.xi, camera.focal_px)
     centre = camera.frame.centre + errors.centre_px * np.array([np.cos(side), np.sin(side)])

@@ -193,6 +193,14 @@ class OmniHouseSettings:
     tilt_deg: Tilt = Field(default=0.0, description="of the camera, constant; its side is drawn")
     calibration: HouseCalibrationSettings = HouseCalibrationSettings()
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for errors of a mirror that is not there."""
+        if self.camera.model != "mirror" and self.calibration != HouseCalibrationSettings():
+            raise ValueError(
+                "dataset.calibration has errors of a mirror, but dataset.camera.model is "
+                f"{self.camera.model}; take mirror, or leave them out"
+            )
+
 
 # --------------------------------------------------------------------------------------------
 # Simulated measurements: the world, the drive, the noise, the faults

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import textured_room
 import yaml
 from advice import Advice
-from bags import camera_info, odometry, raw_image, stereo, write_bag
+from bags import camera_info, in_frames, odometry, raw_image, stereo, tf_static, write_bag
 from dataset_builders import (
     EUROC_SIZE,
     HEIGHT,
@@ -26,12 +29,17 @@ from dataset_builders import (
     picture,
     save,
     write_calibration,
+    write_tum,
 )
 from running import main
 from scipy.spatial.transform import Rotation
+from test_calibrate_command import FISHEYE, draw_boards, draw_rings
 
 from fgslam.core.geometry import pose
+from fgslam.core.sensors import CameraRig
 
+ROOM = TemporaryDirectory(prefix="fgslam_advice_")
+"""What is made once."""
 APART = pose(np.eye(3), np.array([0.2, 0.0, 0.0]))
 
 
@@ -356,18 +364,19 @@ def too_near(root: Path) -> Path:
     return opencv(root, T=[-0.0002, 0.0, 0.0], image_size=[WIDTH, HEIGHT])
 
 
-def topics_of_four(root: Path, apart: float = 0.2) -> Path:
-    """A bag of two pairs, and a calibration that names the topics of all four cameras."""
+def topics_of_four(root: Path, aside: bool = False) -> Path:
+    """A bag of two pairs, and a calibration that names the topics of all four cameras.
+
+    Cameras of the second one perhaps look to other sides, so that they are no pair.
+    """
     write_chain(root, 4, (30.0,))
     values = yaml.safe_load((root / "camchain.yaml").read_text(encoding="utf-8"))
     names = ("/cam/left", "/cam/right", "/rear/left", "/rear/right")
     for each, topic in zip(values.values(), names, strict=True):
         each["rostopic"] = f"{topic}/image_raw"
-    if apart != 0.2:  # the second pair stands above the first one, and looks back
-        step = np.array(values["cam2"]["T_cn_cnm1"])
-        step[:3, :3] = np.diag([-1.0, 1.0, -1.0])
-        step[1, 3] = apart
-        values["cam2"]["T_cn_cnm1"] = step.tolist()
+    if aside:
+        across = pose(Rotation.from_euler("y", 90.0, degrees=True).as_matrix(), np.zeros(3))
+        values["cam2"]["T_cn_cnm1"] = values["cam3"]["T_cn_cnm1"] = across.tolist()
     (root / "camchain.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
     return bag(root, stereo() + stereo(names=("/rear/left", "/rear/right")))
 
@@ -436,6 +445,129 @@ def films_of(name: str, *names: str) -> Callable[[Path], Path]:
 def name_sides(root: Path) -> None:
     (root / "here" / "a.avi").rename(root / "here" / "left.avi")
     (root / "here" / "b.avi").rename(root / "here" / "right.avi")
+
+
+def rectangles(root: Path) -> Path:
+    """Images of a board through a fisheye, made once."""
+    drawn = Path(ROOM.name) / "boards"
+    if not drawn.is_dir():
+        drawn.mkdir()
+        draw_boards(drawn, 14)
+    (root / "boards").symlink_to(drawn)
+    return root / "boards"
+
+
+def zoomed(root: Path) -> Path:
+    """The same with images of another focal length among them, which are `zoom/*` too."""
+    drawn = rectangles(root)
+    (root / "all").mkdir()
+    zoom = Path(ROOM.name) / "zoom"
+    if not zoom.is_dir():
+        zoom.mkdir()
+        draw_boards(zoom, 6, replace(FISHEYE, matrix=FISHEYE.matrix * [[1.5], [1.5], [1.0]]))
+    for path in drawn.iterdir():
+        (root / "all" / path.name).symlink_to(path)
+    for path in zoom.iterdir():
+        (root / "all" / f"zoom_{path.name}").symlink_to(path)
+    return root / "all"
+
+
+def unzoomed(root: Path) -> None:
+    for path in (root / "all").glob("zoom_*"):
+        path.unlink()
+
+
+def markers(root: Path) -> Path:
+    """Images of a board of 7x5 squares with markers of six bits."""
+    (root / "boards").mkdir()
+    known = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_50)
+    print_ = cv2.aruco.CharucoBoard((7, 5), 1.0, 0.7, known).generateImage((1400, 1000))
+    draw_boards(root / "boards", 14, print_=np.asarray(print_))
+    return root / "boards"
+
+
+def rings(root: Path) -> Path:
+    draw_rings(root / "rings.png")
+    return root / "rings.png"
+
+
+def uneven(root: Path) -> Path:
+    """Images of which one came late."""
+    image_folder(root)
+    times = "".join(f"{k:06d} {0.1 * k + 2.0 * (k > 3):.6f}\n" for k in range(6))
+    (root / "times.txt").write_text(times, encoding="utf-8")
+    return root
+
+
+def standing(root: Path) -> Path:
+    """Odometry that states no motion."""
+    image_folder(root)
+    rows = "".join(f"{0.1 * k},0.0,0.0\n" for k in range(7))
+    (root / "odom.csv").write_text(rows, encoding="utf-8")
+    return root
+
+
+def late_against_truth(root: Path) -> Path:
+    """Odometry whose stamps are 0.3 s behind those of the truth."""
+    image_folder(root, frames=40)
+    stamps = 0.1 * np.arange(60)
+    rate = np.sin(2.0 * stamps)
+    rows = (f"{t + 0.3:.6f},1.0,{w:.6f}\n" for t, w in zip(stamps, rate, strict=True))
+    (root / "odom.csv").write_text("".join(rows), encoding="utf-8")
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    for k in range(1, 60):
+        turn = Rotation.from_rotvec([0.0, -0.1 * rate[k], 0.0]).as_matrix()
+        poses[k] = poses[k - 1] @ pose(turn, np.array([0.0, 0.0, 0.1]))
+    write_tum(root / "gt_right_cam.txt", stamps, poses)
+    return root
+
+
+def turning(root: Path) -> Path:
+    """A drive that turns to and fro in a room, and wheels whose clock is 0.2 s behind."""
+    rig = CameraRig(240, 180, 150.0, 150.0, 119.5, 89.5, 0.12, None, np.eye(4))
+    stamps = 0.1 * np.arange(30)
+    rate = 0.8 * np.sin(3.0 * stamps)
+    yaw = np.cumsum(np.concatenate([[0.0], 0.1 * rate[1:]]))
+    for k, angle in enumerate(yaw):
+        right, left = textured_room.stereo(np.array([-1.0, 0.2, angle]), rig)
+        save(root / "right" / f"{k:06d}.png", right)
+        save(root / "left" / f"{k:06d}.png", left)
+    times = "".join(f"{k:06d} {t:.6f}\n" for k, t in enumerate(stamps))
+    (root / "times.txt").write_text(times, encoding="utf-8")
+    write_calibration(root, width=240, height=180, fx=150.0, fy=150.0, cx=119.5, cy=89.5,
+                      baseline_m=0.12)  # fmt: skip
+    rows = (f"{t + 0.2:.6f},0.0,{w:.6f}\n" for t, w in zip(stamps, rate, strict=True))
+    (root / "odom.csv").write_text("".join(rows), encoding="utf-8")
+    return root
+
+
+def pairs_by_tf(root: Path) -> Path:
+    """Cameras without a baseline in camera_info, whose places tf_static states in millimetres."""
+    none = {"p": np.zeros(12)}
+    made = [
+        (topic, stamp, kind, {**fields, **none} if topic.endswith("camera_info") else fields)
+        for topic, stamp, kind, fields in stereo()
+    ]
+    right = np.eye(4)
+    right[0, 3] = 200.0
+    named = in_frames(made, {"/cam/left": "eye_left", "/cam/right": "eye_right"})
+    return bag(
+        root, named + tf_static([("head", "eye_left", np.eye(4)), ("head", "eye_right", right)])
+    )
+
+
+def round_film(root: Path) -> Path:
+    """A film of round pictures, and the mirror that took them."""
+    made = cv2.VideoWriter(
+        str(root / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (304, 240)
+    )
+    for k in range(5):
+        shown = cv2.circle(np.zeros((240, 304), np.uint8), (150, 118), 100, 255, -1)
+        made.write(np.dstack([picture(10 + k, 304, 240) & shown] * 3))
+    made.release()
+    (root / "mirror.yaml").write_text("kind: mirror\nring_px: [10, 98]\n", encoding="utf-8")
+    write_calibration(root)
+    return root / "film.avi"
 
 
 CONVERT = ("camera convert", "{}/out.yaml")
@@ -702,6 +834,77 @@ OF_RECORDINGS = {
         lambda root: with_truth(root, covariances=True),
         r"(--tangent): no word 'sideways'; use (\w+)", r"\1 \2",
         command=("judge", "--truth {}/truth.tum --tangent sideways"), drop="--tangent sideways",
+    ),
+    "no numbers of a board": Advice(
+        rectangles, r"(--board) nine: give columns and rows as 9x6", r"\1 6x4",
+        command=("calibrate omni", "--board nine --square 0.05 --lens equidistant --out {}/c.yaml"),
+        drop="--board nine", slow=True,
+    ),
+    "a board of another size": Advice(
+        rectangles, r"board00.png shows (\d+x\d+); correct (--board)", r"\2 \1",
+        command=("calibrate omni", "--board 7x5 --square 0.05 --lens equidistant --out {}/c.yaml"),
+        drop="--board 7x5", slow=True,
+    ),
+    "another dictionary of markers": Advice(
+        markers, r"squares are counted; is (--dictionary) that of the print",
+        r"\1 DICT_6X6_50", command=(
+            "calibrate omni",
+            "--target charuco --board 7x5 --square 0.05 --lens equidistant --out {}/c.yaml",
+        ), slow=True,
+    ),
+    "images of another focus": Advice(
+        zoomed, r"is --lens that of the camera, its focus fixed", mend=unzoomed,
+        command=("calibrate omni", "--board 6x4 --square 0.05 --lens equidistant --out {}/c.yaml"),
+        slow=True,
+    ),
+    "another mount": Advice(
+        rectangles, r"mirror above .*; if not, give (--mount)", r"\1 up --overwrite",
+        command=("calibrate omni", "--board 6x4 --square 0.05 --lens equidistant --out {}/c.yaml"),
+        slow=True,
+    ),
+    "elevations that are no numbers": Advice(
+        rings, r"give degrees as (--elevations=)-15,-5,5,15", r"\1-15,-5,0,10,20,30,40,50",
+        command=("calibrate rings", "--inner 30 --out {}/m.yaml --elevations a,b"),
+        drop="--elevations a,b",
+    ),
+    "images that are looked at": Advice(
+        lambda root: image_folder(root, frames=301), r"evenly spread; (--frames \d+) reads all",
+        r"\1", slow=True,
+    ),
+    "the only stereo pair of four": Advice(
+        lambda root: topics_of_four(root, aside=True),
+        r"(\S+) and (\S+) are the only two .* form a stereo pair \((--topics) chooses",
+        r"\3 \1,\2",
+        command=("inspect", "--camera {}/camchain.yaml"),
+    ),
+    "transforms in millimetres": Advice(
+        pairs_by_tf, r"which no rig has: .* give the calibration by (--camera) FILE",
+        r"\1 {}/calib.json",
+    ),
+    "wheels of another clock": Advice(
+        turning, r"by the turns that the images show .* (odometry.time_offset_s) is ([-.\d]+)",
+        r"--set \1=\2 --overwrite", command=("run", "--out {}/out"), slow=True,
+    ),
+    "odometry of another clock than the truth": Advice(
+        late_against_truth, r"shifted by (\S+) s; add that to (odometry.time_offset_s)",
+        r"--set \2=\1", slow=True,
+    ),
+    "no folder of that kind": Advice(
+        lambda root: (kitti(root), root)[1],
+        r"KITTI sequence .* does not exist; check dataset.path",
+        command=("inspect", "--set dataset.kind=kitti --set dataset.sequence=\"07\""),
+        drop="--set dataset.sequence=\"07\"",
+    ),
+    "a long step": Advice(
+        uneven, r"steps are longer than .*, or cut with dataset.start and (dataset.stop)",
+        r"--set \1=4",
+    ),
+    "odometry of no motion": Advice(
+        standing, r"states no motion in any .*, or set (odometry.kind) to (\w+)", r"--set \1=\2",
+    ),
+    "a film of round pictures": Advice(
+        round_film, r"routes of such a camera: (fgslam teach \S+ --camera) FILE --out ROUTE",
+        r"\1 {0}/mirror.yaml --out {0}/r.fgpath --report {0}/t", slow=True,
     ),
 }  # fmt: skip
 

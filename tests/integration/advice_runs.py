@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,15 +21,19 @@ import pytest
 import yaml
 from advice import Advice
 from advice_recordings import covariances_of, poses_file, with_truth
-from dataset_builders import image_folder, picture, save
+from bags import stereo, write_bag
+from dataset_builders import image_folder, kitti, picture, save
+from passing import PASSING_RIG, SCENE, pair_of
 from recordings import BASELINE, FOCAL, write_recording
 from running import ROOT, main, stop_after
 from textured_room import SMALL_CAMERA_FILE, folder_of
 
 from fgslam.core.log import MeasurementLog
+from fgslam.core.saved_map import load_map, save_map
+from fgslam.core.types import Trajectory
 from fgslam.homing.route import PathMemory
 from fgslam.runs.bare import short_config
-from fgslam.runs.config import make_config
+from fgslam.runs.config import make_config, make_experiment
 from fgslam.runs.folder import Owner
 from fgslam.runs.run import run_experiment
 
@@ -77,6 +87,12 @@ def interrupted(root: Path) -> Path:
 
 def without_odometry(root: Path) -> Path:
     return run_folder(root, "unsteered", odometry={"kind": "constant_velocity"})
+
+
+def cut_map(root: Path) -> Path:
+    path = run_folder(root) / "landmark_kalman" / "map.ply"
+    path.write_bytes(path.read_bytes()[:-10])
+    return root / "o"
 
 
 def twice(root: Path) -> Path:
@@ -350,6 +366,239 @@ def followed(root: Path) -> Path:
         given = "follow", root / "r.fgpath", root / "drive", "--out", root / "f"
         assert main(patch, *given) == 0
     return root / "f"
+
+
+def passing(
+    root: Path,
+    speed: Callable[[int], float] | None = None,
+    shown: Callable[[int], tuple[Any, Any]] = lambda k: pair_of(list(SCENE), way(k), 0.0),
+    frames: int = 13,
+) -> Path:
+    """A drive to the right past planes.
+
+    Args:
+        root: folder that gets images, calibration and odometry.
+        speed: of a frame what the wheels state of the step that ends there, m/s, ahead on a robot
+            that carries the cameras turned to its left; None without wheels.
+        shown: left and right image of a frame.
+        frames: how many.
+    """
+    for k in range(frames):
+        for side, image in zip(("left", "right"), shown(k), strict=True):
+            save(root / side / f"{k:06d}.png", image)
+    times = "".join(f"{k:06d} {0.1 * k:.6f}\n" for k in range(frames))
+    (root / "times.txt").write_text(times, encoding="utf-8")
+    rig = PASSING_RIG
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    values = {name: getattr(rig, name) for name in names} | {"baseline_m": rig.baseline}
+    if speed is not None:
+        rows = (f"{0.1 * k:.3f},{speed(max(k, 1)):.6f},0.0\n" for k in range(frames + 1))
+        (root / "odom.csv").write_text("".join(rows), encoding="utf-8")
+    (root / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+    return root
+
+
+def way(k: float) -> float:
+    """Metres to the right after k frames: faster and slower."""
+    return 0.05 * k + 0.05 * float(np.sin(0.8 * k))
+
+
+def wheels(k: float) -> float:
+    return 10.0 * (way(k) - way(k - 1))
+
+
+def leap(k: int) -> float:
+    """The same of a robot that is ten times as fast for three frames."""
+    return 0.05 * k + 0.45 * min(max(k - 4, 0), 3)
+
+
+def late_image(k: int, begins: int = 6) -> tuple[Any, Any]:
+    """The left image of the frame before, from one on."""
+    left, right = (pair_of(list(SCENE), way(max(j, 0)), 0.0) for j in (k - (k >= begins), k))
+    return left[0], right[1]
+
+
+def swapped(k: int) -> tuple[Any, Any]:
+    left, right = pair_of(list(SCENE), way(k), 0.0)
+    return (right, left) if k >= 6 else (left, right)
+
+
+def board_passes(k: int) -> tuple[Any, Any]:
+    ahead, left = 0.04 * k, -0.6 + 0.1 * k
+    return pair_of([*SCENE, (1.2 + ahead, left, left + 0.5)], 0.0, ahead)
+
+
+def run_of_bag(root: Path) -> Path:
+    """A run on a bag without odometry: nothing states where its cameras sit."""
+    write_bag(root / "drive.bag", stereo())
+    with pytest.MonkeyPatch.context() as patch:
+        main(patch, "run", root / "drive.bag", "--out", root / "o", *QUIET)
+    return root / "o"
+
+
+def body_run(root: Path) -> Path:
+    """A run on images whose camera sits on a body, and beside it the poses of that body."""
+    given = image_folder(root / "images")
+    (given / "odom.csv").write_text("".join(f"{0.1 * k},1.0,0.1\n" for k in range(8)), "utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        words = "--set", "dataset.camera_yaw_deg=0", "--set", "odometry.kind=recorded"
+        main(patch, "run", given, "--out", root / "o", *words, *QUIET)
+    (root / "p").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        given = root / "o", "--frame", "body", "--trajectory", root / "p" / "body.tum"
+        assert main(patch, "export", *given) == 0
+    taught(root)
+    times = "".join(f"view_{k}.png {0.1 * k:.6f}\n" for k in range(3))
+    (root / "drive" / "times.txt").write_text(times, encoding="utf-8")
+    return root / "drive"
+
+
+def entered(entry: Callable[[dict[str, Any]], object]) -> Callable[[Path], Path]:
+    """An interrupted run that had entered a map, of which its provenance then states other."""
+
+    def make(root: Path) -> Path:
+        images = {"kind": "image_folder", "path": str(boards(root))}
+        held = {"load": str(root / "m.fgmap")}
+        values = SIMULATED | {"dataset": images, "map": held, "rig_memory": "off"}
+        run_experiment(make_config(values, "test"), root / "o", "refuse", lambda *_: None,
+                       stop_after(4))  # fmt: skip
+        path = root / "o" / "config.yaml"
+        text = yaml.safe_load(path.read_text(encoding="utf-8"))
+        entry(text["provenance"]["map"])
+        path.write_text(yaml.safe_dump(text), encoding="utf-8")
+        return path
+
+    return make
+
+
+def without_trajectory(root: Path) -> Path:
+    """A map that holds no poses."""
+    given = boards(root)
+    none = Trajectory(np.empty(0), np.empty((0, 4, 4)))
+    save_map(replace(load_map(root / "m.fgmap"), trajectory=none), root / "m.fgmap")
+    return given
+
+
+def foreign_units(root: Path) -> Path:
+    """Simulated homings that were interrupted, whose results are of another program."""
+    values = {
+        "task": "homing_trials",
+        "name": "x",
+        "trials": 1,
+        "jobs": 1,
+        "outliers": [0.0],
+        "estimator": {"kind": "homing_ekf"},
+        "dataset": {"images_per_s": 2.0},
+        "output": {"logs": 1, "report": False},
+    }
+    run_experiment(make_experiment(values, "test"), root / "o", "refuse", lambda *_: None,
+                   lambda: True)  # fmt: skip
+    (root / "o" / "units").mkdir(exist_ok=True)
+    np.savez(root / "o" / "units" / "trials_000000.npz", a=np.zeros(3))
+    return root / "o" / "config.yaml"
+
+
+def program_of(*lines: str) -> Callable[[Path], Path]:
+    """A program of the library's in a folder, `{}` in it."""
+
+    def make(root: Path) -> Path:
+        text = "\n".join(["import fgslam as fg", *lines]).replace("{}", str(root))
+        (root / "program.py").write_text(text + "\n", encoding="utf-8")
+        return root / "program.py"
+
+    return make
+
+
+def two_cameras(root: Path) -> Path:
+    """A map of two routes, taught with different cameras, and what asks it for a place."""
+    taught(root)
+    other = SMALL_CAMERA_FILE.replace("54", "53")
+    (root / "other.yaml").write_text(other, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        given = "--camera", root / "other.yaml", "--out", root / "s.fgpath", "--report", root / "u"
+        assert main(patch, "teach", root / "drive", *given) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        given = "--out", root / "j.fgmap", "--report", root / "v"
+        assert main(patch, "join", root / "r.fgpath", root / "s.fgpath", *given) == 0
+    return asking("")(root)
+
+
+def asking(more: str) -> Callable[[Path], Path]:
+    return program_of(
+        "import cv2",
+        "image = cv2.imread('{}/drive/view_0.png')",
+        f"fg.RouteMap.load('{{}}/j.fgmap').locate(image{more})",
+    )
+
+
+def mirror_aside(root: Path) -> Path:
+    round_pictures(root)
+    text = "kind: mirror\ncentre: [140, 45]\nring_px: [10, 44]\n"
+    (root / "mirror.yaml").write_text(text, encoding="utf-8")
+    return root / "photos"
+
+
+def lens_pictures(root: Path) -> Path:
+    round_pictures(root)
+    lens = {
+        "camera_model": "omni",
+        "intrinsics": [0.92, 25.0, 25.0, 150.0, 45.0],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [0.0] * 4,
+        "resolution": [301, 91],
+    }
+    (root / "camchain.yaml").write_text(json.dumps({"cam0": lens}), encoding="utf-8")
+    text = "kind: lens\nfile: camchain.yaml\nring_px: [10, 44]\n"
+    (root / "lens.yaml").write_text(text, encoding="utf-8")
+    return root / "photos"
+
+
+def views_of_pairs(root: Path) -> Path:
+    """An experiment on panoramas that it wants larger than they are."""
+    taught(root)
+    camera = {"kind": "equirectangular", "top_elevation_deg": 54, "bottom_elevation_deg": -54}
+    dataset = {"kind": "panoramas", "path": str(root / "drive"), "camera": camera, "width": 999}
+    values = {"task": "homing_pairs", "name": "x", "jobs": 1, "dataset": dataset}
+    (root / "x.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return root / "x.yaml"
+
+
+def of_mirror_errors(root: Path) -> Path:
+    """An experiment in the house with errors of a mirror, but no mirror."""
+    dataset = {"kind": "omni_house", "path": {"legs": 1, "spacing_m": 2.0}}
+    dataset |= {"camera": {"model": "equirectangular"}, "calibration": {"centre_px": 2.0}}
+    values = {
+        "task": "path_following",
+        "name": "x",
+        "jobs": 1,
+        "trials": 1,
+        "dataset": dataset,
+        "behaviour": {"loop": {"longest_s": 0.3}},
+        "output": {"pictures": 1, "report": False},
+    }
+    (root / "x.yaml").write_text(yaml.safe_dump(values), encoding="utf-8")
+    return root / "x.yaml"
+
+
+def begin_scheduler(root: Path) -> None:
+    """One of Dask's on this machine, until the tests end."""
+    file, begin = root / "scheduler.json", "from distributed.cli.dask_scheduler import main; main()"
+    given = "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
+    process = subprocess.Popen([sys.executable, "-c", begin, *given])  # noqa: S603
+    atexit.register(process.kill)
+    while not file.is_file():
+        assert process.poll() is None
+        time.sleep(0.1)
+
+
+def stopped_at_once(patch: pytest.MonkeyPatch) -> None:
+    """As by Ctrl-C while the command begins."""
+    patch.setattr("fgslam.cli.main.stop_flag", lambda: nullcontext(lambda: True))
+
+
+def without_screen(patch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        patch.delenv(name, raising=False)
 
 
 QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
@@ -779,5 +1028,154 @@ OF_RUNS = {
     "covariances that are zero": Advice(
         without_covariances, r"or give them by (--covariance) FILE", r"\1 {}/covariances.txt",
         covariances_of, command=("judge", "--truth {}/truth.tum"),
+    ),
+    "wheels of a camera that looks aside": Advice(
+        lambda root: passing(root, wheels),
+        r"are (90) degrees off .* or (dataset.camera_yaw_deg)\)", r"--set \2=\1 --overwrite",
+        command=RUN, slow=True,
+    ),
+    "wheels that are late": Advice(
+        lambda root: passing(
+            root,
+            lambda k: 10.0 * (leap(k - 3) - leap(k - 4)),
+            lambda k: pair_of(list(SCENE), leap(k), 0.0),
+        ),
+        r"by no factor that stays .* its clock \((odometry.time_offset_s)\)",
+        r"--set \1=-0.3 --overwrite",
+        command=("run", "--out {}/o --set dataset.camera_yaw_deg=90"), slow=True,
+    ),
+    "frozen cameras": Advice(
+        lambda root: passing(
+            root, lambda k: 2.0, lambda k: pair_of(list(SCENE), 0.2 * min(k, 5), 0.0)
+        ),
+        r"are not used; their poses are predicted \(mend the camera; (--set \S+) uses them all",
+        r"\1 --overwrite", command=("run", "--out {}/o --set dataset.camera_yaw_deg=90"), slow=True,
+    ),
+    "images that are swapped underway": Advice(
+        lambda root: passing(root, wheels, swapped),
+        r"are predicted \(swap their images; (--set \S+) uses them all", r"\1 --overwrite",
+        command=("run", "--out {}/o --set dataset.camera_yaw_deg=90"), slow=True,
+    ),
+    "old images of one camera": Advice(
+        lambda root: passing(root, wheels, late_image),
+        r"begin no landmark \(mend the camera; (--set \S+) uses them all", r"\1 --overwrite",
+        command=("run", "--out {}/o --set dataset.camera_yaw_deg=90"), slow=True,
+    ),
+    "frames that are there twice": Advice(
+        lambda root: passing(root, None, lambda k: pair_of(list(SCENE), way(k // 2), 0.0)),
+        r"the recording has frames twice, .* \(leave them out: (--stride)\)",
+        r"\1 2 --overwrite", command=RUN, slow=True,
+    ),
+    "something large that passes": Advice(
+        lambda root: passing(root, None, board_passes, 6),
+        r"what passes \(leave these frames out: --start, (--stop)\)", r"\1 2 --overwrite",
+        command=RUN, slow=True,
+    ),
+    "a corrected calibration": Advice(
+        boards, r"the calibration, corrected; use it by (--camera \S+)",
+        r"fgslam run {0}/boards \1 --out {0}/n",
+        command=("run", "--out {}/o --camera-out {}/a.json"), slow=True,
+    ),
+    "no screen": Advice(
+        of_images(odometry={"kind": "constant_velocity"}), r"use (--save-rrd) FILE(.rrd)",
+        r"\1 {}/a\2", command=("run", "--out {}/o --live"), drop="--live", where=without_screen,
+    ),
+    "no scheduler": Advice(
+        experiment, r"no Dask scheduler answers .* start one by `dask scheduler`",
+        "--scheduler {}/scheduler.json", begin_scheduler,
+        ("sweep", "--out {}/s --set seed=1 --scheduler tcp://127.0.0.1:9"),
+        "--scheduler tcp://127.0.0.1:9", slow=True,
+    ),
+    "voxels of no size": Advice(
+        run_of_boards, r"--voxel is -1; give metres above 0, or leave it out",
+        command=("export", "--dense {}/a.ply --voxel -1"), drop="--voxel -1", slow=True,
+    ),
+    "no frame of so many": Advice(
+        run_of_boards, r"--every is 0; give (1) for all frames", r"--every \1",
+        command=("export", "--dense {}/a.ply --every 0"), drop="--every 0", slow=True,
+    ),
+    "poses of a body": Advice(
+        run_of_bag, r"on a body; give (--frame left)", r"\1",
+        command=("export", "--trajectory {}/a.tum --frame body"), drop="--frame body",
+    ),
+    "poses of a body for a route": Advice(
+        body_run, r"give a camera's, by fgslam export RUN (--frame) (right)",
+        "--poses {}/p/right.tum",
+        lambda root: main(pytest.MonkeyPatch(), "export", root / "o", "--frame", "right",
+                          "--trajectory", root / "p" / "right.tum"),
+        ("teach", "--camera {}/camera.yaml --out {}/n.fgpath --report {}/n --poses {}/p/body.tum"),
+        "--poses {}/p/body.tum", slow=True,
+    ),
+    "a map that has changed": Advice(
+        entered(lambda entry: entry.update(sha256="x")),
+        r"has changed since the run began; .* run again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume", slow=True,
+    ),
+    "a run that does not state its map": Advice(
+        entered(lambda entry: entry.pop("file")),
+        r"does not say how the run entered its map .* run again with (--overwrite)", r"\1",
+        command=("run", "--out {}/o --resume"), drop="--resume", slow=True,
+    ),
+    "a map without a last pose": Advice(
+        without_trajectory, r"knows no last pose; use (map.start) (relocalise)", r"--set \1=\2",
+        command=("run", "--out {}/o --map-in {}/m.fgmap --set map.start=last"),
+        drop="--set map.start=last", slow=True,
+    ),
+    "a log that begins in a map": Advice(
+        lambda root: (entered(lambda entry: None)(root), program_of(
+            "fg.replay(fg.MeasurementLog.load('{}/o/measurements.npz'), 'landmark_kalman')")(root),
+        )[1],
+        r"fgslam run with map.load, then (fgslam compare) RUN",
+        r"\1 {}/o --estimators landmark_kalman", command=("python", ""), slow=True,
+    ),
+    "a map of several cameras": Advice(
+        two_cameras, r"give the image's: camera=fgslam.load_camera", mend=asking(
+            ", camera=fg.load_camera('{}/camera.yaml', size=(301, 91))"
+        ), command=("python", ""), slow=True,
+    ),
+    "results of another program": Advice(
+        foreign_units, r"not a unit that this fgslam wrote .* start again with (--overwrite)",
+        r"\1", command=("run", "--out {}/o --resume"), drop="--resume",
+    ),
+    "panoramas that are smaller": Advice(
+        views_of_pairs, r"(dataset.width) is 999 .* have only (\d+) columns; give a smaller width",
+        r"--set \1=\2", command=RUN, slow=True,
+    ),
+    "errors of no mirror": Advice(
+        of_mirror_errors, r"but (dataset.camera.model) is \w+; take (mirror)", r"--set \1=\2",
+        command=RUN, slow=True,
+    ),
+    "a mirror aside of its place": Advice(
+        mirror_aside, r"off its stated centre .* rim's is \((\S+), (\S+)\); .* correct (\S+) or",
+        r"--set \3.centre=[\1,\2] --overwrite",
+        command=("teach", "--camera {}/mirror.yaml --out {}/n.fgpath --report {}/n"), slow=True,
+    ),
+    "where a lens looks": Advice(
+        lens_pictures, r"taken to look down, .* \(--set (dataset.camera.middle=up)",
+        r"--set \1 --overwrite",
+        command=("teach", "--camera {}/lens.yaml --out {}/n.fgpath --report {}/n"),
+        slow=True,
+    ),
+    "a route that was interrupted": Advice(
+        taught, r"go on: the same command with (--overwrite)", r"\1",
+        command=("teach", "--camera {}/camera.yaml --out {}/n.fgpath --report {}/n"), slow=True,
+        where=stopped_at_once,
+    ),
+    "a scene that is far": Advice(
+        boards, r"min_disparity_px = 3: the scene is far .*; use larger images",
+        command=("inspect", "--set frontend.stereo.min_disparity_px=3 --set dataset.scale=0.5"),
+        drop="--set dataset.scale=0.5", slow=True,
+    ),
+    "a map that is cut off": Advice(
+        cut_map, r"is no landmark map, or cut off; run the experiment again with (--overwrite)",
+        r"fgslam run {0}/o/config.yaml --out {0}/o \1", command=("export", "--map {}/a.ply"),
+    ),
+    "recordings that are made here": Advice(
+        lambda root: root / "house", r"next: (fgslam teach .* --out) home.fgpath",
+        r"\1 {0}/r.fgpath --report {0}/t", command=("data house --out", ""), slow=True,
+    ),
+    "recordings that are made elsewhere": Advice(
+        lambda root: (kitti(root), root)[1], r"(fgslam run) DIR (--set '\S+')",
+        r"\1 {0} \2 --out {0}/o", command=("data kitti_odometry --out", ""), slow=True,
     ),
 }  # fmt: skip

@@ -204,11 +204,16 @@ FISHEYE = RawCamera(
 )
 
 
-def draw_boards(folder: Path, count: int) -> None:
-    """Chessboards of 6x4 corners of 50 mm through a fisheye of 180 degrees, off its axis too."""
+def draw_boards(
+    folder: Path, count: int, camera: RawCamera = FISHEYE, print_: np.ndarray | None = None
+) -> None:
+    """Chessboards of 6x4 corners of 50 mm through a fisheye of 180 degrees, off its axis too.
+
+    Or another print of 7x5 squares, grey (rows, columns).
+    """
     fine = (np.arange(1440.0) + 0.5) / 2.0 - 0.5  # four rays a pixel
     columns, rows = np.meshgrid(fine, fine)
-    rays = FISHEYE.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+    rays = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
     rng = np.random.default_rng(2)
     for number in range(count):
         tilt, off_axis = rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.5, 0.5, 2)
@@ -219,7 +224,12 @@ def draw_boards(folder: Path, count: int) -> None:
         flat = (rays * np.where(depth > 0.0, depth, np.nan)[:, None] - away) @ turn / 0.05
         across, down = np.floor(flat[:, 0]) + 1.0, np.floor(flat[:, 1]) + 1.0
         on = (across >= 0) & (across <= 6) & (down >= 0) & (down <= 4)
-        image = np.where(on & ((across + down) % 2 == 0), 30.0, 200.0).reshape(1440, 1440)
+        dark = (across + down) % 2 == 0
+        if print_ is not None:
+            texels = (np.nan_to_num(flat[:, :2] + 1.0) / (7, 5) * print_.shape[::-1]).astype(int)
+            column, row = np.clip(texels, 0, np.array(print_.shape[::-1]) - 1).T
+            dark = print_[row, column] < 128
+        image = np.where(on & dark, 30.0, 200.0).reshape(1440, 1440)
         image = cv2.resize(
             cv2.GaussianBlur(image, (0, 0), 1.4), (720, 720), None, 0, 0, cv2.INTER_AREA
         )
@@ -310,22 +320,29 @@ def test_a_board_in_ten_bits_is_seen_as_a_run_sees_it(
     assert "shows the board in 1 images" in capfd.readouterr().err
 
 
+BORDERS_DEG = (-15.0, -5.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
+
+
+def draw_rings(path: Path) -> RadialPolynomial:
+    """Rings around a camera as a mirror shows them, which is returned."""
+    centre, outer = (161.0, 118.5), 100.0
+    mirror = RadialPolynomial(MirrorFrame(320, 240, centre), 25.0, outer, (0.2, 0.7, 0.1))
+    column, row = np.meshgrid(np.arange(320), np.arange(240))
+    radius = np.hypot(column - centre[0], row - centre[1])
+    elevation = mirror.elevation(radius.ravel()).reshape(radius.shape)
+    bands = np.where(np.searchsorted(np.radians(BORDERS_DEG), elevation) % 2, 60.0, 200.0)
+    image = cv2.GaussianBlur(np.where(radius < outer, bands, 5.0), (0, 0), 0.7)
+    cv2.imwrite(str(path), image.astype(np.uint8))
+    return mirror
+
+
 def test_a_mirror_is_calibrated_from_an_image_of_rings(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     """The picture is drawn by a known mirror; the calibration gives its elevations back."""
-    centre, outer, inner = (161.0, 118.5), 100.0, 25.0
-    frame = MirrorFrame(320, 240, centre)
-    mirror = RadialPolynomial(frame, inner, outer, (0.2, 0.7, 0.1))
-    column, row = np.meshgrid(np.arange(320), np.arange(240))
-    radius = np.hypot(column - centre[0], row - centre[1])
-    elevation = mirror.elevation(radius.ravel()).reshape(radius.shape)
-    borders = np.radians([-15.0, -5.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
-    bands = np.where(np.searchsorted(borders, elevation) % 2, 60.0, 200.0)
-    image = cv2.GaussianBlur(np.where(radius < outer, bands, 5.0), (0, 0), 0.7)
-    cv2.imwrite(str(tmp_path / "rings.png"), image.astype(np.uint8))
+    mirror = draw_rings(tmp_path / "rings.png")
     out = tmp_path / "mirror.yaml"
-    elevations = "--elevations=" + ",".join(f"{a:.0f}" for a in np.degrees(borders))
+    elevations = "--elevations=" + ",".join(f"{a:.0f}" for a in BORDERS_DEG)
     arguments = (tmp_path / "rings.png", elevations, "--inner", "30", "--out", out)
     assert main(monkeypatch, "calibrate", "rings", *arguments) == 0
     assert "calibration" in capfd.readouterr().out

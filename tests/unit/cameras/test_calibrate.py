@@ -339,7 +339,7 @@ def test_an_image_without_a_pose_is_left_out_of_the_calibration() -> None:
 def test_a_fit_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MOST_STEPS", 2)
     true = CAMERAS["fisheye"]
-    with pytest.raises(CalibrationError, match="equidistant cameras does not converge in 2 steps"):
+    with pytest.raises(CalibrationError, match="do not determine the cameras"):
         calibrate(BOARD, views_of("fisheye", 0), true.size, true.model)
 
 

@@ -141,7 +141,7 @@ def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="No such file"):
         read_ply(path)
     path.write_text("OFF\n")
-    with pytest.raises(DatasetError, match="no landmark map; give"):
+    with pytest.raises(DatasetError, match="no landmark map, or cut off"):
         read_ply(path)
     write_map(path, a_map(5))
     whole = path.read_bytes()

@@ -218,7 +218,7 @@ def test_images_that_show_no_depth_are_named() -> None:
 def test_voxels_too_small_for_the_cameras_say_which_would_do() -> None:
     with pytest.raises(ConfigError, match=r"0.77 cm wide .* use --voxel 0.0077"):
         fused(DenseSettings(voxel_m=0.001))
-    with pytest.raises(DatasetError, match="within 1 m; use larger voxels"):
+    with pytest.raises(DatasetError, match="within 1 m; use a larger --sigma"):
         fused(DenseSettings(voxel_m=0.05, range_m=1.0))
 
 

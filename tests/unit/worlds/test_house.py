@@ -17,6 +17,7 @@ from fgslam.worlds.renderer import noisy
 from fgslam.worlds.settings import (
     HouseCalibrationSettings,
     HouseCameraSettings,
+    OmniHouseSettings,
 )
 
 
@@ -50,9 +51,9 @@ def test_a_wrong_calibration_is_off_by_what_is_asked_for() -> None:
 
 
 def test_a_panorama_has_no_mirror_to_be_wrong_about() -> None:
-    camera = make_house_camera(HouseCameraSettings("equirectangular"))
-    with pytest.raises(CalibrationError, match=r"dataset\.calibration: .* take mirror"):
-        miscalibrated(camera, HouseCalibrationSettings(mirror=0.01), rng())
+    panorama, errors = HouseCameraSettings("equirectangular"), HouseCalibrationSettings(mirror=0.01)
+    with pytest.raises(ValueError, match=r"dataset\.calibration has .* take mirror"):
+        OmniHouseSettings(camera=panorama, calibration=errors)
 
 
 def test_noise_is_that_of_its_name() -> None:
