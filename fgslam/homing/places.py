@@ -190,7 +190,7 @@ class PathPlaces:
         """By all candidate matches; what the first look alone sees may as well be another one."""
         s, target = self._settings, self._path.images[node]
         matching, rng = s.features.matching, self._rng
-        answer, matches = vector_between(image, target, matching, s.homing_vector, rng, False)
+        answer, matches = vector_between(image, target, matching, s.homing_vector, rng, alone=False)
         if answer:
             return self._seen(node, answer, matches)
         if answer.reason is RefusalReason.AMBIGUOUS and not is_near(answer, self._matches[node]):
