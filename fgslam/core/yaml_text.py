@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from yaml.composer import Composer
 
 from fgslam.core.errors import FgslamError
 from fgslam.core.files import read_text
@@ -24,26 +23,21 @@ _NOT_MEANT = (ValueError, LookupError, AttributeError, TypeError, OverflowError)
 """What PyYAML lets through for scalars that are not of their tag."""
 _TIMESTAMP = "tag:yaml.org,2002:timestamp"
 
-_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's takes a quarter of the time; PyYAML can be built without it."""
 
-
-class PlainLoader(_SafeLoader, Composer):  # type: ignore[misc]
+class PlainLoader(yaml.SafeLoader):
     """The safe loader, with errors that name their line, and dates as the text that they are."""
 
     most_values = _MOST_VALUES
-    get_single_node = Composer.get_single_node  # libyaml's asks no `compose_node`
 
     def __init__(self, text: str) -> None:
-        _SafeLoader.__init__(self, text)
-        Composer.__init__(self)
+        super().__init__(text)
         self._depth = self._count = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """As the safe loader's. Raises yaml.YAMLError beyond the limits of depth and number."""
         self._depth += 1
         self._count += 1
-        mark = self.peek_event().start_mark
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
         if self._depth > _DEEPEST:
             raise yaml.MarkedYAMLError(problem=f"nested over {_DEEPEST} deep", problem_mark=mark)
         if self._count > self.most_values:
