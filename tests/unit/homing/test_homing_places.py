@@ -94,7 +94,7 @@ class World:
         return places.look(replace(self._some))
 
     def _look_again(
-        self, image: OmniFeatures, target: OmniFeatures, *__: object
+        self, image: OmniFeatures, target: OmniFeatures, *__: object, alone: bool
     ) -> tuple[TwoViewVector | Refusal, BearingMatches]:
         answer, matches = self._compare(image, target)
         if answer and self.doubt:
