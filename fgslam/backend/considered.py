@@ -193,14 +193,14 @@ class RigTerms:
     """
 
     deviations: Kept[FloatArray | None]
-    _path: Kept[list[tuple[float, FloatArray]]]  # stamps and poses, the last two
+    _path: Kept[list[tuple[float, FloatArray]]]  # stamps and poses, the last two, to tell rates
     _applied: Kept[FloatArray]
     _field_px: Kept[float]
 
     def __init__(self, sensor: CameraRig) -> None:
         """Those of a rig that is not exact."""
         self.rig = None if sensor.exact else sensor
-        self._late, self._path = int(sensor.readout_s > 0.0), []
+        self._late, self._path = sensor.readout_s > 0.0, []
         self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig)) + self._late
         """How many there are, q."""
         self.deviations = None
@@ -222,10 +222,12 @@ class RigTerms:
 
         False where rows are not of one moment, and it is not known yet how the camera moves.
         """
-        self._path = [*self._path[-1:], (increment.timestamp, wTc)]
         known = increment.settled_rig
         self._hear(increment.rig_correction, 0.0 if known is None else known.field_px)
-        return len(self._path) > self._late
+        if not self._late:
+            return True
+        self._path = [*self._path[-1:], (increment.timestamp, wTc)]
+        return len(self._path) > 1
 
     def shifts(self, measured: FloatArray, by_pose: FloatArray) -> FloatArray:
         """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero where known.
@@ -238,9 +240,11 @@ class RigTerms:
         of_pixels = [shared_displacements(self.rig, pixels), field_displacements(self.rig, pixels)]
         if self.rig.stated:
             of_pixels.append(displacements(self.rig, pixels))
+        of_terms = fused(self.rig, np.concatenate(of_pixels, axis=2))
+        if not self._late:
+            return of_terms
         rates = rates_of(*map(np.array, zip(*self._path, strict=True)))[-1:]
-        late = read_late(self.rig, measured, by_pose, rates)[..., : self._late]
-        return np.concatenate([fused(self.rig, np.concatenate(of_pixels, axis=2)), late], axis=2)
+        return np.concatenate([of_terms, read_late(self.rig, measured, by_pose, rates)], axis=2)
 
     def _hear(self, correction: FloatArray | None, field_px: float) -> None:
         """Both change seldom."""

@@ -99,9 +99,12 @@ def with_uncertain_rig(found: Refined, rig: RigCorrection) -> Bordered:
     covariance = np.asarray(block_diag(correction, shared, rig.field_px**2 * np.eye(modes)))
     joint = np.vstack([np.eye(count), follows])
     covariance = joint @ covariance @ joint.T + block_diag(0.0 * covariance, read)
-    whitened = graph.weights[:, None] * graph.seen.look(state.poses, state.points).residual
-    slope = np.einsum("ki,kij,kjr->r", whitened, graph.seen.roots, late) + known @ found.read_s
-    return Bordered(held, gain, covariance, np.append(np.zeros(count), read @ slope))
+    change = np.zeros(len(covariance))
+    if len(found.read_s):
+        whitened = graph.weights[:, None] * graph.seen.look(state.poses, state.points).residual
+        slope = np.einsum("ki,kij,kjr->r", whitened, graph.seen.roots, late) + known @ found.read_s
+        change[count:] = read @ slope
+    return Bordered(held, gain, covariance, change)
 
 
 def late_rows(found: Refined) -> FloatArray:
@@ -109,11 +112,13 @@ def late_rows(found: Refined) -> FloatArray:
 
     (k, 3, 0) where all rows are of one moment.
     """
-    seen, state, rows = found.graph.seen, found.state, len(found.read_s)
+    seen, state = found.graph.seen, found.state
+    if not len(found.read_s):
+        return np.empty((len(seen), 3, 0))
     look = seen.look(state.poses, state.points)
     by_pose = np.asarray(np.linalg.solve(seen.roots, look.by_pose), np.float64)
     rates = rates_of(found.stamps, state.poses)[seen.poses]
-    return read_late(seen.model, seen.measured, by_pose, rates)[..., :rows]
+    return read_late(seen.model, seen.measured, by_pose, rates)
 
 
 def of_one_moment(found: Refined) -> Refined:
