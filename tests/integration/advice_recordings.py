@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -158,11 +158,15 @@ def uncalibrated_euroc(root: Path) -> Path:
     return root
 
 
-def late_odometry(root: Path) -> Path:
+def odometry_of(root: Path, rows: Iterable[str]) -> Path:
+    """Images with odometry of these lines."""
     image_folder(root)
-    rows = "".join(f"{1000.0 + 0.1 * k},1.0,0.0\n" for k in range(7))
-    (root / "odom.csv").write_text(rows, encoding="utf-8")
+    (root / "odom.csv").write_text("".join(rows), encoding="utf-8")
     return root
+
+
+def late_odometry(root: Path) -> Path:
+    return odometry_of(root, (f"{1000.0 + 0.1 * k},1.0,0.0\n" for k in range(7)))
 
 
 def two_layouts(root: Path) -> Path:
@@ -392,9 +396,7 @@ def five_terms(root: Path) -> Path:
 
 
 def one_sample(root: Path) -> Path:
-    image_folder(root)
-    (root / "odom.csv").write_text("0.1,1.0,0.0\n", encoding="utf-8")
-    return root
+    return odometry_of(root, ["0.1,1.0,0.0\n"])
 
 
 def unreadable(root: Path) -> Path:
@@ -501,10 +503,7 @@ def uneven(root: Path) -> Path:
 
 def standing(root: Path) -> Path:
     """Odometry that states no motion."""
-    image_folder(root)
-    rows = "".join(f"{0.1 * k},0.0,0.0\n" for k in range(7))
-    (root / "odom.csv").write_text(rows, encoding="utf-8")
-    return root
+    return odometry_of(root, (f"{0.1 * k},0.0,0.0\n" for k in range(7)))
 
 
 def late_against_truth(root: Path) -> Path:
