@@ -218,7 +218,8 @@ def nearest_positive(covariance: FloatArray) -> FloatArray:
 
 def transported(transforms: FloatArray, points: FloatArray) -> FloatArray:
     """Points (n, 3), each moved by its own rigid motion (n, 4, 4)."""
-    return np.asarray(np.einsum("nij,nj->ni", transforms[:, :3, :3], points) + transforms[:, :3, 3])
+    moved = np.einsum("nij,nj->ni", transforms[:, :3, :3], points)
+    return np.asarray(moved + transforms[:, :3, 3])
 
 
 def changes(before: FloatArray, after: FloatArray) -> FloatArray:

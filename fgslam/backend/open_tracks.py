@@ -38,7 +38,8 @@ class Tracks:
 
 def tracks_of(counts: IntArray) -> Tracks:
     """Tracks of so many sightings (m,)."""
-    return Tracks(np.cumsum(counts) - counts, int(counts.sum()))
+    ends = np.cumsum(counts)
+    return Tracks(ends - counts, int(counts.sum()))
 
 
 class OpenTracks(GrowingColumns):

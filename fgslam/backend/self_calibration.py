@@ -538,7 +538,8 @@ class WeighedCorrection:
 
     def applying(self, values: FloatArray) -> WeighedCorrection:
         """The same with another correction applied (p,)."""
-        return dataclasses.replace(self, applied=dataclasses.replace(self.applied, values=values))
+        applied = dataclasses.replace(self.applied, values=values)
+        return dataclasses.replace(self, applied=applied)
 
 
 # --------------------------------------------------------------------------------------------
@@ -796,7 +797,8 @@ class RigAlignment:
         coupling, inverse = self._coupling(point_left @ joint), np.linalg.inv(curvature)
         eliminated, flat = (of.reshape(-1, len(gradient)) for of in (inverse @ coupling, coupling))
         hessian -= eliminated.T @ flat
-        return _Normal(hessian, gradient - pull.ravel() @ eliminated, inverse, coupling, pull)
+        gradient = gradient - pull.ravel() @ eliminated
+        return _Normal(hessian, gradient, inverse, coupling, pull)
 
     def _of_frames(
         self, state: _State, joint: FloatArray, weighted: FloatArray
@@ -889,4 +891,5 @@ class RigChange:
         seen = ahead & ((before[:, :2] >= 0.0) & (before[:, :2] < size)).all(axis=1)
         seen &= after[:, 2] > _LEAST_SHARE * before[:, 2]
         again = self.rig.triangulate(np.where(seen[:, None], after, before))
-        return np.where(seen[:, None], np.einsum("kij,kj->ki", turn, again) + place, positions)
+        again = np.einsum("kij,kj->ki", turn, again) + place
+        return np.where(seen[:, None], again, positions)

@@ -245,7 +245,8 @@ def _origin(graph: StepGraph, first: int) -> Any:
 
 def _prior(graph: StepGraph, first: int) -> Any:
     make, n = (gtsam.PriorFactorPose2, 3) if graph.planar else (gtsam.PriorFactorPose3, 6)
-    return make(first, _origin(graph, first), gtsam.noiseModel.Isotropic.Sigma(n, _FIRST_SIGMA))
+    noise = gtsam.noiseModel.Isotropic.Sigma(n, _FIRST_SIGMA)
+    return make(first, _origin(graph, first), noise)
 
 
 def _whole(graph: StepGraph, first: int) -> Any:

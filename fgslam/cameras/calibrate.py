@@ -507,7 +507,8 @@ def camera_of(
     model: str, size: tuple[int, int], numbers: FloatArray, name: str = "camera"
 ) -> RawCamera:
     """The camera of fx, fy, cx, cy and the model's parameters, at the body's origin."""
-    return RawCamera(*size, intrinsic_matrix(*numbers[:4]), numbers[4:], np.eye(4), name, model)
+    matrix = intrinsic_matrix(*numbers[:4])
+    return RawCamera(*size, matrix, numbers[4:], np.eye(4), name, model)
 
 
 def board_pose(camera: RawCamera, points: FloatArray, pixels: FloatArray) -> FloatArray | None:

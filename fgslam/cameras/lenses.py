@@ -116,7 +116,8 @@ def _undistorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
         if not np.abs(left).max(initial=0.0, where=np.isfinite(left)) > 0.01 * _CONVERGED:
             break
         found = found - _solved(parameters, found, left)
-    return _seen(found, np.abs(left).max(axis=1) < _CONVERGED)
+    good = np.abs(left).max(axis=1) < _CONVERGED
+    return _seen(found, good)
 
 
 def _solved(parameters: FloatArray, at: FloatArray, left: FloatArray) -> FloatArray:
@@ -139,7 +140,8 @@ def _solved(parameters: FloatArray, at: FloatArray, left: FloatArray) -> FloatAr
 
 def _on_radius(rays: FloatArray, radius: FloatArray) -> FloatArray:
     across = np.hypot(rays[:, 0], rays[:, 1])
-    return rays[:, :2] * np.where(across > 0.0, radius / np.maximum(across, 1e-300), 0.0)[:, None]
+    factor = np.where(across > 0.0, radius / np.maximum(across, 1e-300), 0.0)
+    return rays[:, :2] * factor[:, None]
 
 
 def _at_angle(plane: FloatArray, angle: FloatArray) -> FloatArray:
@@ -189,7 +191,8 @@ def _fov_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
     (w,) = parameters
     ahead = rays[:, 2] > _AHEAD
     tangent = np.hypot(rays[:, 0], rays[:, 1]) / np.where(ahead, rays[:, 2], 1.0)
-    return _seen(_on_radius(rays, np.arctan(2.0 * tangent * np.tan(0.5 * w)) / w), ahead)
+    radius = np.arctan(2.0 * tangent * np.tan(0.5 * w)) / w
+    return _seen(_on_radius(rays, radius), ahead)
 
 
 def _fov_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
@@ -209,7 +212,8 @@ def _ds_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
     shifted = xi + z
     below = alpha * np.hypot(np.hypot(rays[:, 0], rays[:, 1]), shifted) + (1.0 - alpha) * shifted
     w1 = _edge(alpha)
-    return _over(rays, below, z > -((w1 + xi) / np.sqrt(2.0 * w1 * xi + xi**2 + 1.0)))
+    w2 = (w1 + xi) / np.sqrt(2.0 * w1 * xi + xi**2 + 1.0)
+    return _over(rays, below, z > -w2)
 
 
 def _edge(alpha: float) -> float:
@@ -244,14 +248,16 @@ def _eucm_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
     r2 = beta * (plane**2).sum(axis=1)
     root = 1.0 - (2.0 * alpha - 1.0) * r2
     below = alpha * np.sqrt(np.maximum(root, 0.0)) + 1.0 - alpha
-    return _seen(np.column_stack([plane, (1.0 - alpha**2 * r2) / below]), root >= 0.0)
+    rays = np.column_stack([plane, (1.0 - alpha**2 * r2) / below])
+    return _seen(rays, root >= 0.0)
 
 
 def _omni_project(parameters: FloatArray, rays: FloatArray) -> FloatArray:
     xi = parameters[0]
     z = rays[:, 2]
     # Of a sphere that is looked at from outside only the near side is seen.
-    return _distorted(parameters[1:], _over(rays, z + xi, z > -(1.0 / xi if xi > 1.0 else xi)))
+    seen = z > -(1.0 / xi if xi > 1.0 else xi)
+    return _distorted(parameters[1:], _over(rays, z + xi, seen))
 
 
 def _omni_unproject(parameters: FloatArray, plane: FloatArray) -> FloatArray:
@@ -392,7 +398,8 @@ class RawCamera:
         """Pixels for a radian around the middle of the view."""
         centre = self.matrix[:2, 2]
         rays = self.unproject(centre + np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]]))
-        return float(2.0 / np.mean([_between(rays[a], rays[a + 1]) for a in (0, 2)]))
+        across = [_between(rays[a], rays[a + 1]) for a in (0, 2)]
+        return float(2.0 / np.mean(across))
 
     def field_of_view(self) -> FloatArray:
         """Horizontal, vertical and diagonal angle of view (3,) in radians."""

@@ -72,7 +72,8 @@ def unit_rays(bearing: FloatArray, elevation: FloatArray) -> FloatArray:
 def angles_of(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bearings and elevations (n,) of rays (n, 3), radians."""
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
-    return bearing, np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+    elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+    return bearing, elevation
 
 
 def measure(
@@ -166,7 +167,8 @@ def _bearing(columns: FloatArray, width: int) -> FloatArray:
 
 
 def _column(rays: FloatArray, width: int) -> FloatArray:
-    return (_HALF_TURN - np.arctan2(rays[:, 1], rays[:, 0])) * ((width - 1) / (2.0 * _HALF_TURN))
+    bearing = np.arctan2(rays[:, 1], rays[:, 0])
+    return (_HALF_TURN - bearing) * ((width - 1) / (2.0 * _HALF_TURN))
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,7 +352,8 @@ class RadialCamera(ABC):
         """(n, 3) unit rays; see :class:`OmniCamera`."""
         pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
         radius, bearing = self.frame.polar(pixels)
-        return unit_rays(bearing, self.elevation(self._within(radius)))
+        elevation = self.elevation(self._within(radius))
+        return unit_rays(bearing, elevation)
 
     def pixels(self, rays: FloatArray) -> FloatArray:
         """(n, 2) pixels; see :class:`OmniCamera`."""
@@ -512,7 +515,8 @@ class RadialPolynomial(RadialCamera):
         slope = polynomial.polyder(np.array(self.coefficients))
         per_pixel = 2.0 / (self.outer_radius - self.inner_radius)
         x = _scaled(radius, self.inner_radius, self.outer_radius)
-        return self.elevation(radius), np.asarray(per_pixel * polynomial.polyval(x, slope))
+        slopes = per_pixel * polynomial.polyval(x, slope)
+        return self.elevation(radius), np.asarray(slopes)
 
 
 def _scaled(radius: FloatArray, inner: float, outer: float) -> FloatArray:
@@ -548,7 +552,8 @@ def fit_radial_polynomial(
     x = _scaled(radius, *radii)
     coefficients = polynomial.polyfit(x, elevation, degree)
     camera = RadialPolynomial(frame, *radii, coefficients=tuple(coefficients.tolist()))
-    return camera, float(np.abs(elevation - polynomial.polyval(x, coefficients)).max())
+    residuals = elevation - polynomial.polyval(x, coefficients)
+    return camera, float(np.abs(residuals).max())
 
 
 # --------------------------------------------------------------------------------------------

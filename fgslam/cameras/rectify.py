@@ -99,7 +99,8 @@ class Rectifier(Brief):
         width, height = self.raw_size
         shown = self.shown[camera] if self.shown else None
         if not self.maps:
-            return np.ones((height, width), np.bool_) if shown is None else shown > 0
+            whole = np.ones((height, width), np.bool_)
+            return whole if shown is None else shown > 0
         columns, rows = self.maps[camera]
         # A pixel reaches half a pixel around its centre.
         seen = (columns >= -0.5) & (columns <= width - 0.5)

@@ -467,7 +467,8 @@ def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> C
             f"{calibration.source}: cameras is {cameras!r}; give two or three of 0 to {count - 1}"
         )
     calibration.require_uncorrected("some of its cameras are chosen")
-    return replace(calibration, cameras=tuple(calibration.cameras[k] for k in cameras), view=None)
+    chosen = tuple(calibration.cameras[k] for k in cameras)
+    return replace(calibration, cameras=chosen, view=None)
 
 
 def in_metres(calibration: Calibration, unit_m: float) -> Calibration:
@@ -650,7 +651,8 @@ Placed = tuple[tuple[int, ...], FloatArray, tuple[str, ...]]
 
 def _offset(camera: RawCamera, reference: RawCamera) -> FloatArray:
     """Position (3,) of a camera in another's axes."""
-    return np.asarray((camera.bTc[:3, 3] - reference.bTc[:3, 3]) @ reference.bTc[:3, :3])
+    turned = reference.bTc[:3, :3]
+    return np.asarray((camera.bTc[:3, 3] - reference.bTc[:3, 3]) @ turned)
 
 
 def _pair(cameras: Sequence[RawCamera]) -> Placed:

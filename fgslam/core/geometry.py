@@ -270,7 +270,8 @@ def yaw_pitch_roll(wTc: FloatArray) -> tuple[float, float, float]:
     r = wTc[:3, :3]
     pitch = float(np.arcsin(np.clip(-r[1, 2], -1.0, 1.0)))
     yaw = float(np.arctan2(r[0, 2], r[2, 2]))
-    return yaw, pitch, float(np.arctan2(r[1, 0], r[1, 1]))
+    roll = float(np.arctan2(r[1, 0], r[1, 1]))
+    return yaw, pitch, roll
 
 
 # --------------------------------------------------------------------------------------------
@@ -320,7 +321,8 @@ def rotate_covariances(aRb: FloatArray, covariances: FloatArray) -> FloatArray:
 
     One matrix product for all of them: ``vec(R C R^T) = (R kron R) vec(C)``.
     """
-    return np.asarray((covariances.reshape(-1, 9) @ np.kron(aRb, aRb).T).reshape(-1, 3, 3))
+    flat = covariances.reshape(-1, 9) @ np.kron(aRb, aRb).T
+    return np.asarray(flat.reshape(-1, 3, 3))
 
 
 def inverse_spd3(matrices: FloatArray) -> FloatArray:
@@ -401,7 +403,8 @@ def planar_inverse(aTb: FloatArray) -> FloatArray:
     aTb = np.asarray(aTb, dtype=np.float64)
     c, s = np.cos(aTb[..., 2]), np.sin(aTb[..., 2])
     x = -c * aTb[..., 0] - s * aTb[..., 1]
-    return _poses(x, s * aTb[..., 0] - c * aTb[..., 1], -aTb[..., 2])
+    y = s * aTb[..., 0] - c * aTb[..., 1]
+    return _poses(x, y, -aTb[..., 2])
 
 
 def _poses(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:

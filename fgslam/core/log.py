@@ -349,7 +349,8 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
             f"{path}: ids do not increase by whole numbers, or a number is not finite; run the "
             "experiment again"
         )
-    return LandmarkTruth(ids.astype(np.int64), values[:, 1:4].copy()), values[:, 4].copy()
+    truth = LandmarkTruth(ids.astype(np.int64), values[:, 1:4].copy())
+    return truth, values[:, 4].copy()
 
 
 # ------------------------------------------------------------------------------------------

@@ -71,7 +71,8 @@ class Resumable(Protocol):
 def pack(value: Any) -> StateArrays:
     """A value as arrays. Raises TypeError for what is neither data nor made of it."""
     packing = _Packing()
-    return packing.arrays | {TREE: np.array(json.dumps(packing.column([value], "")))}
+    tree = packing.column([value], "")
+    return packing.arrays | {TREE: np.array(json.dumps(tree))}
 
 
 def unpack(arrays: StateArrays, kind: Any) -> Any:

@@ -83,7 +83,8 @@ class StereoFeatures(Rows):
         """Those found in every image, under the same numbers."""
         if self.complete is None:
             return self
-        return replace(self.select(np.flatnonzero(self.complete)), complete=None)
+        found = self.select(np.flatnonzero(self.complete))
+        return replace(found, complete=None)
 
     def noisier(self, factors: FloatArray) -> StereoFeatures:
         """The same with variances that are larger by factors (n,)."""

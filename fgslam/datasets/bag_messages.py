@@ -229,7 +229,8 @@ _UPWARD = 0.7071  # cosine of 45 degrees
 
 def frame_of(message: Any) -> str:
     """The frame in which a message is given; of an Odometry that whose motion it is."""
-    return str(getattr(message, "child_frame_id", message.header.frame_id)).strip("/")
+    own = message.header.frame_id
+    return str(getattr(message, "child_frame_id", own)).strip("/")
 
 
 def transforms_of(message: Any) -> list[tuple[str, str, FloatArray]]:

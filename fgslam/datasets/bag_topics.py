@@ -232,7 +232,8 @@ def _by_names(
         notes.insert(0, f"{text}: topics are recognised by their names")
     names = (*used, *(pair[1] for pair in third))
     numbers = (0, 1, 2) if third else ()
-    return Chosen(tuple(by_view[name] for name in names), numbers, tuple(notes), guessed=bool(also))
+    shown = tuple(by_view[name] for name in names)
+    return Chosen(shown, numbers, tuple(notes), guessed=bool(also))
 
 
 def _list(topics: Sequence[Topic]) -> str:

@@ -438,7 +438,8 @@ def camera_of_file(
             f"colour images: say it: --set dataset.colour_camera=0 for {found.cameras[0].name}, "
             f"1 for {found.cameras[1].name}, and so on"
         )
-    return at_size(replace(found, cameras=(left[0],), view=None), size, settings.resized).cameras[0]
+    alone = replace(found, cameras=(left[0],), view=None)
+    return at_size(alone, size, settings.resized).cameras[0]
 
 
 def _camera(

@@ -165,7 +165,8 @@ def _recordings_in(folder: Path) -> str:
             if any(not layout.lacking(path) for layout in LAYOUTS.values()) or images_in(path)
         ]
         if found:
-            return " or ".join(found[:3]) + (f" or {len(found) - 3} more" if len(found) > 3 else "")
+            more = f" or {len(found) - 3} more" if len(found) > 3 else ""
+            return " or ".join(found[:3]) + more
     return ""
 
 

@@ -415,7 +415,8 @@ def speed_motions(
     translation = (settings.speed_sigma_mps, _LATERAL_SIGMA_MPS, _VERTICAL_SIGMA_MPS)
     rates = np.concatenate([np.radians(rotation), translation])
     covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
-    return _steps(poses, covariances, steps_covered(stamps, frames, _MAX_GAP_S, _MAX_GAP_S))
+    known = steps_covered(stamps, frames, _MAX_GAP_S, _MAX_GAP_S)
+    return _steps(poses, covariances, known)
 
 
 _POSE_HOLD_S = 1e-3

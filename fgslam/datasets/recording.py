@@ -436,7 +436,8 @@ def in_order(rig: StereoRig) -> StereoRig:
     """The rig of images that are given as right, left[, top], whatever the file calls them."""
     if rig.rectifier is None:
         return rig
-    return replace(rig, rectifier=replace(rig.rectifier, order=tuple(range(rig.cameras))))
+    order = tuple(range(rig.cameras))
+    return replace(rig, rectifier=replace(rig.rectifier, order=order))
 
 
 def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:

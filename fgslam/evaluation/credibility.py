@@ -73,7 +73,8 @@ class Tangent:
                 change[:, :3, :3] = bRw
         if self.unit == "degrees":
             change[:, :, :3] /= _PER_RADIAN
-        return np.asarray(change @ covariances[:, swap][:, :, swap] @ np.swapaxes(change, 1, 2))
+        ordered = covariances[:, swap][:, :, swap]
+        return np.asarray(change @ ordered @ np.swapaxes(change, 1, 2))
 
 
 def tangent_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -82,7 +83,8 @@ def tangent_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray,
     ``Log(T_est^-1 T)``; and ``Log(R_est^T R)`` with ``t - t_est``.
     """
     whole = pose_errors(estimate, truth)
-    return whole, np.hstack([whole[:, :3], (inverse(estimate) @ truth)[:, :3, 3]])
+    apart = (inverse(estimate) @ truth)[:, :3, 3]
+    return whole, np.hstack([whole[:, :3], apart])
 
 
 def guess_tangent(

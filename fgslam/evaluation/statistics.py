@@ -153,7 +153,8 @@ def rotation_angles(rotations: FloatArray) -> FloatArray:
     """Angles (n,) in radians, in [0, pi], of rotation matrices (n, 3, 3)."""
     antisymmetric = 0.5 * (rotations - np.swapaxes(rotations, -1, -2))
     sine = np.linalg.norm(antisymmetric[:, [2, 0, 1], [1, 2, 0]], axis=1)
-    return np.asarray(np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)))
+    cosine = 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))
 
 
 def relative_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -75,7 +75,8 @@ def unsound_start(estimate: FloatArray, truth: FloatArray) -> int:
     if not 0 < count <= _LONGEST_START * len(estimate):
         return 0
     over = _differences(estimate, truth, count)
-    return count if (over[0] > _ALONE * over[count:].max(axis=0, initial=_STILL)).any() else 0
+    elsewhere = over[count:].max(axis=0, initial=_STILL)
+    return count if (over[0] > _ALONE * elsewhere).any() else 0
 
 
 def unsound_singles(estimate: FloatArray, truth: FloatArray) -> IntArray:
@@ -88,7 +89,8 @@ def unsound_singles(estimate: FloatArray, truth: FloatArray) -> IntArray:
     over = ~_wide(_differences(estimate, truth, 2)).any(axis=1)
     jerks = _bends(truth)
     jerky = _wide(jerks) & (jerks > _ALONE * _bends(estimate))
-    return np.flatnonzero(np.any(wide[:-1] & wide[1:] & jerky, axis=1) & over) + 1
+    alone = np.any(wide[:-1] & wide[1:] & jerky, axis=1) & over
+    return np.flatnonzero(alone) + 1
 
 
 def _differences(estimate: FloatArray, truth: FloatArray, lag: int) -> FloatArray:

@@ -263,7 +263,8 @@ def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
     """Relocaliser without a prior, for the poses that the ego-motion allows."""
     from fgslam.frontend.places.relocalisation import Relocaliser
 
-    return Relocaliser(rig, Floor.under(rig, settings.ego_motion.dof), settings.relocalisation)
+    floor = Floor.under(rig, settings.ego_motion.dof)
+    return Relocaliser(rig, floor, settings.relocalisation)
 
 
 def make_locator(

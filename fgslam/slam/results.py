@@ -109,7 +109,8 @@ class RunRecorder:
     @property
     def online(self) -> Trajectory:
         """Each pose as it was first estimated, at its own time."""
-        return Trajectory(self.log.timestamps, np.array(self.online_poses).reshape(-1, 4, 4))
+        poses = np.array(self.online_poses).reshape(-1, 4, 4)
+        return Trajectory(self.log.timestamps, poses)
 
     @property
     def seen(self) -> IntArray:

@@ -521,7 +521,8 @@ def checked_odometry(
     if given is None:
         return None
     if isinstance(given, Odometry):
-        return replace(given, motion=_rigid(given.motion), covariance=_covariance(given.covariance))
+        motion = _rigid(given.motion)
+        return replace(given, motion=motion, covariance=_covariance(given.covariance))
     motion = _rigid(given)
     noise = settings if isinstance(settings, RecordedOdometrySettings) else None
     return Odometry(motion, pose_noise(motion, noise or RecordedOdometrySettings()))

@@ -335,7 +335,8 @@ class Witnesses:
         solved = self._tracker.solved(chain, there, (expected, matches, rest))
         had = ~free
         had[where] = matches.had_candidates
-        return replace(solved, matches=MapMatches(matches.landmarks, where[matches.features], had))
+        matches = MapMatches(matches.landmarks, where[matches.features], had)
+        return replace(solved, matches=matches)
 
     def _off(self, frame: Frame, chain: Prediction, pose: EgoMotion) -> bool:
         """Whether a pose is none that odometry explains."""

@@ -509,7 +509,8 @@ class FullEkf:
     def _blocks(self, ids: IntArray) -> IntArray:
         """Block of each landmark. KeyError for an unknown one."""
         order = np.argsort(self._ids, kind="stable")
-        return order[LandmarkMap(self._ids[order], self._positions, np.empty(0)).rows(ids)]
+        known = LandmarkMap(self._ids[order], self._positions, np.empty(0))
+        return order[known.rows(ids)]
 
     # -- what is reported, and a saved map -----------------------------------------------------
 
@@ -833,4 +834,5 @@ def rows_of(blocks: IntArray) -> IntArray:
 
 def _mirrored(lower: FloatArray) -> FloatArray:
     """Square matrices (..., k, k) of which the lower triangles count."""
-    return np.asarray(np.tril(lower) + np.swapaxes(np.tril(lower, -1), -1, -2))
+    strict = np.tril(lower, -1)
+    return np.asarray(np.tril(lower) + np.swapaxes(strict, -1, -2))

@@ -161,7 +161,8 @@ class FastSlam:
             self._positions[:, at].reshape(n * k, 3), self._covariances[:, at].reshape(n * k, 3, 3)
         )
         measured = np.tile(observed.measurement, (n, 1))
-        return linearise(self._rig, poses.repeat(k, axis=0), known.positions, measured), known
+        rows = linearise(self._rig, poses.repeat(k, axis=0), known.positions, measured)
+        return rows, known
 
     def _propose(
         self, start: FloatArray, noise: FloatArray, observed: Observations, at: IntArray

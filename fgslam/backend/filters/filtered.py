@@ -134,4 +134,5 @@ def triangulated(
     points = rig.triangulate(observed.measurement)
     kept = in_front(points)
     observed, points = observed.select(kept), points[kept]
-    return observed, points, rig.triangulation_covariance(observed.measurement, observed.covariance)
+    covariances = rig.triangulation_covariance(observed.measurement, observed.covariance)
+    return observed, points, covariances

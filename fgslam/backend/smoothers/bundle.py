@@ -274,7 +274,8 @@ class Turns:
 
     def cost(self, poses: FloatArray, bias: FloatArray) -> float:
         """Half the sum of squares, with what is known of the bias (3q,) beforehand."""
-        return 0.5 * float((self.residuals(poses, bias) ** 2).sum() + bias @ self.known @ bias)
+        residuals = self.residuals(poses, bias)
+        return 0.5 * float((residuals**2).sum() + bias @ self.known @ bias)
 
     def residuals(self, poses: FloatArray, bias: FloatArray) -> FloatArray:
         """(k, 6) whitened: how far each pose (n, 4, 4) is off from where its step leads."""
@@ -598,7 +599,8 @@ class WholeGraph:
 
     def weighed(self, weights: FloatArray | BoolArray) -> WholeGraph:
         """Without kernel, its observations with weights (k,)."""
-        return dataclasses.replace(self, weights=np.asarray(weights, np.float64), kernel=PLAIN)
+        new = np.asarray(weights, np.float64)
+        return dataclasses.replace(self, weights=new, kernel=PLAIN)
 
     def masked(self, rows: BoolArray) -> WholeGraph:
         """Without the other observations (k,), with its kernel."""
@@ -792,7 +794,8 @@ def _pulled(
     of_points = _summed(points, np.swapaxes(rows.by_point, 1, 2) @ known)
     of_poses = _summed(poses, np.swapaxes(rows.by_pose, 1, 2) @ known)
     p = by.shape[2]
-    return np.concatenate([*of_points, *of_poses, by.reshape(-1, p).T @ known.reshape(-1, p)])
+    own = by.reshape(-1, p).T @ known.reshape(-1, p)
+    return np.concatenate([*of_points, *of_poses, own])
 
 
 def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:

@@ -273,7 +273,8 @@ def order(links: csr_matrix) -> tuple[IntArray, int]:
     place = np.empty_like(found)
     place[found] = np.arange(len(found))
     row = np.repeat(np.arange(len(place)), np.diff(links.indptr))
-    return place, int(np.abs(place[row] - place[links.indices]).max(initial=1))
+    apart = np.abs(place[row] - place[links.indices])
+    return place, int(apart.max(initial=1))
 
 
 # ------------------------------------------------------------------------------------------
@@ -770,7 +771,8 @@ class GraphMarginals:
         pull = np.einsum(*own, gradients[:m].reshape(-1, 3, c)).reshape(m, c)
         poses = -self.factor.solve(gradients[m:] - s.coupling @ pull)
         follows = (s.coupling.T @ poses).reshape(-1, 3, c)
-        return np.concatenate([-pull - np.einsum(*own, follows).reshape(m, c), poses])
+        landmarks = -pull - np.einsum(*own, follows).reshape(m, c)
+        return np.concatenate([landmarks, poses])
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""

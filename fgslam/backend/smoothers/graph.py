@@ -880,7 +880,8 @@ def _row(frames: IntArray, frame: int) -> int:
 def _as_solved(known: Constraint, frames: IntArray, poses: FloatArray) -> Constraint:
     """A constraint between rows of the graph's frames, met as the solution meets it."""
     before, after = _row(frames, known.before), _row(frames, known.after)
-    return Constraint(before, after, inverse(poses[before]) @ poses[after], known.covariance)
+    motion = inverse(poses[before]) @ poses[after]
+    return Constraint(before, after, motion, known.covariance)
 
 
 def _moved(

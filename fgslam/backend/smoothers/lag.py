@@ -250,7 +250,8 @@ class FixedLagSolver:
     def _covariance(self, frame: int) -> FloatArray:
         solved = self._at_last()
         covariance = solved.eliminated.pose(solved.frames.index(frame))
-        return np.asarray(allowed_parts(self._floor, self.poses[frame][None], covariance[None])[0])
+        kept = allowed_parts(self._floor, self.poses[frame][None], covariance[None])
+        return np.asarray(kept[0])
 
 
 def earlier_poses(solved: Solved) -> dict[int, FloatArray]:
@@ -439,7 +440,8 @@ class SlidingWindowSolver(WholeGraphSolver):
     def _newest(self, rows: IntArray) -> IntArray:
         """Of observations in their order the last one of each landmark, by ascending variable."""
         variables = self.builder.observed["variable"][rows]
-        return np.asarray(rows[::-1][np.unique(variables[::-1], return_index=True)[1]])
+        last = np.unique(variables[::-1], return_index=True)[1]
+        return np.asarray(rows[::-1][last])
 
     def _bring(self, rows: IntArray) -> None:
         """Landmarks, by an observation each, into the window, but those that have yet to wait.

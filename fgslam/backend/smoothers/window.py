@@ -275,7 +275,8 @@ class SeenAgain(Rows):
         )
         alone = off.fit_with(np.zeros(len(self), np.bool_), drift)
         surely = alone & off.outweigh(drift)
-        return np.asarray(surely | off.agreeing(alone, drift))
+        together = off.agreeing(alone, drift)
+        return np.asarray(surely | together)
 
 
 def _at_known_depth(
